@@ -71,7 +71,7 @@ SHARES = (0.001, 0.003, 0.01)
 
 @dataclass(frozen=True)
 class Compared:
-    """One quantity in two sessions, in its unit: value and standard deviation here and there.
+    """Quantity compared in two sessions, in its unit: value and standard deviation of each.
 
     ``sigmas`` is the difference, other less this, over the standard deviation of both together;
     NaN where that is zero.
@@ -114,7 +114,7 @@ class ConfirmedCause:
 
 @dataclass(frozen=True)
 class Confirmation:
-    """How causes found in one session do in another."""
+    """Result of checking the causes found in one session on another."""
 
     # Rows of the other session, and those of them that are common to all causes
     rows: int
@@ -220,7 +220,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
 
 
 def share_of_gain(before: float, frozen: float, own: float) -> float:
-    """Return the share of what could be gained in mean square that frozen causes gain.
+    """Return the gain by frozen causes in mean square, as a share of the possible gain.
 
     Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
     most 1: what frozen causes gain could be gained. NaN where that is next to nothing.
@@ -237,7 +237,7 @@ def _with(choices: Choices, index: int, choice: Choice) -> Choices:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """What one session knows of its natural parameters and of m parameters of the arm's errors.
+    """Normal equations of a session for its natural parameters and m of the arm's errors.
 
     Products X'WX of the columns of the former, the latter, and the errors; ``plain`` where errors
     of the measuring are none.
@@ -255,7 +255,7 @@ class _Measured:
         candidates: Sequence[Candidate],
         alone: Sequence[_Weighted],
     ) -> _Measured:
-        """Take what rows know of candidates, where others settle."""
+        """Assemble the equations of rows, with the candidates `alone` marginalised."""
         natural = data.full_jacobian[data.rows.source]
         further = data.columns([candidate for candidate, _ in alone])
         parts = natural, data.columns(candidates), data.errors[:, :, None], further
@@ -275,9 +275,9 @@ class _Measured:
         return int(self.data.full_jacobian.shape[2])
 
     def apart(self, precision: FloatArray) -> tuple[FloatArray, float]:
-        """Return the products where the arm's errors are others, by this precision, (m, m).
+        """Return the products with the arm's errors marginalised, and the log evidence lost.
 
-        And what the log evidence loses by that.
+        ``precision``: of the errors' prior, (m, m).
         """
         where = slice(self.size, self.size + len(precision))
         across = self.products[where]
@@ -299,7 +299,7 @@ class _Fitted:
     there: IntArray
 
     def covariance(self, where: IntArray) -> FloatArray:
-        """Return the covariance of some of what is fitted."""
+        """Return the covariance of some parameters; ``where``: their indices."""
         unit = np.zeros((len(self.values), len(where)))
         unit[where, np.arange(len(where))] = 1.0
         found: FloatArray = cho_solve((self.root, False), unit)[where]
@@ -361,7 +361,7 @@ class _Both:
         return self.fit.model.joints
 
     def where(self, group: Sequence[int]) -> IntArray:
-        """Return where the parameters of some candidates are among the m."""
+        """Return the indices of some candidates' parameters among the m."""
         edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         parts = [np.arange(edges[i], edges[i + 1]) for i in group]
         return np.concatenate([np.zeros(0, np.int64), *parts])
@@ -404,13 +404,16 @@ class _Both:
 
     @cached_property
     def _of_the_other(self) -> tuple[FloatArray, float]:
-        """Products of the other session beside what is its own of all errors, and its price."""
+        """Products of the other session, its own errors marginalised, and the evidence lost."""
         if self.share == 0.0:
             return self.there.products, 0.0
         return self.there.apart(self.precision / self.share)
 
     def most_likely(self) -> tuple[_Both, Choices]:
-        """Return what single changes reach from all shared, each at odds of twenty to one."""
+        """Return the choices with the most evidence that single changes reach from all 'shared'.
+
+        Each change counts if its odds are above twenty to one.
+        """
         # What happened once is no matter of the other session.
         possible = [CHOICES[:2]] * self.joints
         possible += [CHOICES if group else ('shared',) for group in self.groups]
@@ -431,7 +434,7 @@ class _Both:
             value, (both, best) = max(values), tried[int(np.argmax(values))]
 
     def judged(self, best: Choices, index: int, rows: BoolArray) -> ConfirmedCause:
-        """Judge one cause, everything else as it is best; errors are those of some rows."""
+        """Judge one cause, all others at their best choices; RMS errors are those of `rows`."""
         group = self.groups[index]
         if not group:
             return ConfirmedCause(0, np.nan, np.nan, np.nan, ())
@@ -504,7 +507,7 @@ class _Both:
         return rms(left, judged)
 
     def own(self, best: Choices) -> list[int]:
-        """Return the joints of which each session has its own zero-offset."""
+        """Return the joints (from 0) whose zero-offset differs between the sessions."""
         return [joint for joint, choice in enumerate(best[: self.joints]) if choice == 'own']
 
     def offsets(self, best: Choices, joint: int) -> tuple[FloatArray, FloatArray] | None:
@@ -522,7 +525,7 @@ class _Both:
         return self.here.data.context.joint_offsets[joint] + fit.values[where], covariance
 
     def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
-        """Compare the zero-offsets that both sessions determine, the causes as they are best."""
+        """Compare the zero-offsets that both sessions determine, at the best choices of causes."""
         rows: list[Compared] = []
         chain = discovery.fit.chain
         for joint, name in enumerate(discovery.fit.joint_names):
@@ -533,7 +536,7 @@ class _Both:
         return tuple(rows)
 
     def _side_by_side(self, group: Sequence[int], own: _Fitted) -> tuple[Compared, ...]:
-        """Compare the parameters of a cause: as they are, or a curve at its places."""
+        """Compare the parameters of a cause, of a curve its heights at the places seen in both."""
         rows: list[Compared] = []
         for i in group:
             candidate, wide, where = self.found[i], self.candidates[i], self.where([i])
@@ -575,7 +578,7 @@ def _compared(
 
 
 def answer_of(evidence: Mapping[Choice, float]) -> Answer:
-    """Return what the evidence says; 'open': there or not, or there but maybe of another size."""
+    """Return the answer by the evidence of each choice; 'open' if presence or size is."""
     shared, own, absent = evidence['shared'], evidence['own'], evidence['absent']
     if max(own, absent) > shared + NEEDED:
         return 'changed' if own > absent + NEEDED else 'absent'
@@ -585,7 +588,10 @@ def answer_of(evidence: Mapping[Choice, float]) -> Answer:
 
 
 def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, list[_Weighted]]:
-    """Return a session's noise beside causes and all kinds of errors, and its measuring's."""
+    """Return a session's noise, and its measuring errors with their prior precisions.
+
+    [] for the latter unless all kinds of errors together explain the session better.
+    """
     others = [
         candidate
         for effect in EFFECTS.values()
@@ -610,7 +616,7 @@ def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, lis
 
 
 def _natural(size: int, per_radian: FloatArray | None = None) -> FloatArray:
-    """Return the prior precision of natural parameters: of zero-offsets if any, then of others.
+    """Return the prior precision of natural parameters, (size,); zero-offsets come first, if any.
 
     Registrations and markers are known to a metre and a radian: to nothing that counts.
     """
@@ -672,7 +678,7 @@ def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
 
 
 def _seen(candidate: Candidate, mine: Context) -> Callable[[Context], BoolArray]:
-    """Return what tells in which rows of another session a candidate's driver was seen here."""
+    """Return a function that tells rows in which the driver is in the range seen here."""
     driver = driver_named(mine, candidate.driver, candidate.joints[-1] if candidate.joints else 0)
     if driver is not None:
         if candidate.curve is not None:
@@ -790,7 +796,7 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
 
 
 def _said(cause: ConfirmedCause) -> str:
-    """Return what the other session says of a cause, behind its title."""
+    """Return the other session's answer on a cause as text, to follow its title."""
     change = f'{1e3 * cause.rms_without_m:.3f} to {1e3 * cause.rms_frozen_m:.3f} mm RMS'
     share = (
         f'as found here it goes from {change}'

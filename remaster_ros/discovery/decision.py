@@ -30,13 +30,13 @@ class Named(NamedTuple):
     joints: tuple[int, ...]
 
     def __str__(self) -> str:
-        """Return it in a few words."""
+        """Return the cause in a few words."""
         return called(self.name, self.joints)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Which of two causes it is."""
+    """Decision between a cause and its look-alike."""
 
     # As they were before
     cause: Named
@@ -49,7 +49,7 @@ class Decision:
     sigma: float  # How sure the answer is, in standard deviations
 
     def describe(self) -> str:
-        """Return it in a line."""
+        """Return the decision in one line."""
         if self.answer == 'neither':
             return f'the search now names neither {self.cause} nor {self.look_alike}'
         first, second = self.cause, self.look_alike
@@ -61,13 +61,13 @@ class Decision:
 
 
 def sigma_of(log_odds: float) -> float:
-    """Return the standard deviations that are as rare as an error at these odds, one-sided."""
+    """Return the standard deviations whose one-sided tail has the probability of these odds."""
     return max(0.0, float(-ndtri_exp(-np.logaddexp(0.0, abs(log_odds)))))
 
 
 @one_thread
 def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[Decision, ...]:
-    """Compare two causes of each pair by what was measured since.
+    """Decide between the two causes of each pair, by all that was measured.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def _without(found: Discovery, *causes: Named) -> float:
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
-    """Return the log evidence with a cause in place of another; None where it cannot be fitted."""
+    """Return the log evidence with a cause in place of another; None if it cannot be fitted."""
     every, rest = _candidates(found), _rest(found, cause, other)
     named = [candidate for group in found.groups for candidate in group]
     present = tuple(candidate for candidate in named if _belongs(candidate, cause))

@@ -59,7 +59,7 @@ NOT_LOADED = 'No robot model with it predicts held-out poses better than the zer
 
 @dataclass(frozen=True, eq=False)
 class Discovery:
-    """What was found in a session.
+    """Result of a search for causes in a session.
 
     Attributes
     ----------
@@ -328,7 +328,7 @@ def discover_session(
 def _to_search(
     session: Session, before: Estimate, rng: np.random.Generator
 ) -> tuple[Estimate, Residuals, IntArray]:
-    """Return the fit to search beside, its residuals, and the rows that may be searched."""
+    """Return the fit to be extended by causes, its residuals, and the rows to search."""
     found, residuals = before, Residuals.of(before)
     bare = solve(residuals, ())
     moved = moved_markers(found, residuals, bare.noise, ()) if bare is not None else ()
@@ -407,7 +407,7 @@ def _judged(
 
 
 def _as_it_is(left: FloatArray, kept: BoolArray) -> FloatArray:
-    """Return what a model leaves, whichever rows are kept: it is not fitted again."""
+    """Return residuals of a model that is not fitted again, whichever rows are kept."""
     return left
 
 

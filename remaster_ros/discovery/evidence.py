@@ -59,9 +59,9 @@ def log_prior_one_by_one(candidates: Sequence[Candidate]) -> float:
 def solve(
     data: Residuals, candidates: Sequence[Candidate], start: Solution | None = None
 ) -> Solution | None:
-    """Fit a set of candidates; None where one of them adds nothing to the others.
+    """Fit a set of candidates, which may be empty; None if they cannot be distinguished.
 
-    It may be empty. The search for noise and smoothness begins at those of another fit, if given.
+    The search for noise and smoothness begins at those of `start`, if given.
     """
     system = System.of(data, candidates)
     if system is None or not system.visible():
@@ -155,7 +155,7 @@ class System:
         self.of_parameters = packed.length(self.size)
 
     def visible(self) -> bool:
-        """Return whether the unpenalised columns add something to the others and to the base."""
+        """Return whether the unpenalised columns are independent of each other and of the base."""
         part = self.grams[:, : packed.length(self.unpenalised)].sum(axis=0)
         part[packed.diagonal(self.unpenalised)] += 1e-14
         root, wrong = dpotrf(packed.upper(part, self.unpenalised), overwrite_a=1)
@@ -167,7 +167,7 @@ class System:
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
     def value(self, eta: FloatArray) -> float:
-        """Return L, by eta: logarithms of the sigmas, of what rows share, of the smoothness."""
+        """Return L, the restricted log likelihood; ``eta``: logs of sigmas, shares, smoothness."""
         weights, factors = self._precisions(eta)
         total, factor, beta = self._solved(eta)
         value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(factor.root)))
@@ -275,7 +275,7 @@ class System:
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
-        """Return the fit at the maximum of L, with the log prior of its candidates."""
+        """Return the fit at the maximum of L; ``prior``: log prior of its candidates."""
         known = {} if start is None else start.factors()
         noise = self.guess if start is None else start.noise
         eta = self._most_likely(*self._start(known, noise))
@@ -360,7 +360,7 @@ class System:
     def _start(
         self, known: Mapping[object, float], noise: Noise
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return where the search for noise and smoothness begins, and its bounds."""
+        """Return the start of the search for noise and smoothness, with lower and upper bounds."""
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
         least = 0.1 * noise.sigma
         shared = self.model.shared(
@@ -386,7 +386,7 @@ class System:
         return np.clip(eta, low, high), low, high
 
     def _typical(self, which: int, noise: Noise) -> float:
-        """Return the factor at which a penalty and the data weigh about the same."""
+        """Return the smoothness factor at which penalty and data have about equal weight."""
         where = self.where[self.penalised[which]]
         diagonal = self.grams[:, packed.diagonal(self.size)[where]].sum(axis=1)
         data = diagonal @ (1.0 / self.model.variances(noise))
@@ -410,7 +410,10 @@ class _Cholesky:
 
 
 def _covariances(H: _Cholesky, unit: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances by H in units, of all, and of the first were the others known."""
+    """Return the covariance by H, scaled by `unit`, and that of its first parameters alone.
+
+    The latter is conditional: all other parameters are known.
+    """
     full = H.inverse + H.inverse.T
     np.einsum('ii->i', full)[:] *= 0.5
     full /= unit[:, None]

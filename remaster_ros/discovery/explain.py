@@ -135,7 +135,10 @@ class FoundEffect:
         return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))
 
     def _clear_sizes(self, group: Sequence[Candidate]) -> tuple[str, ...]:
-        """Return the sizes that are more than their uncertainty, and how many others there are."""
+        """Return the sizes that exceed their uncertainty, and a count of the others.
+
+        All of them if none does.
+        """
         sigmas = {one.name: abs(one.value) / one.std for one in self.parameters if one.std > 0.0}
         clear = tuple(
             size
@@ -161,7 +164,7 @@ class FoundEffect:
 
     @property
     def is_taken_out(self) -> bool:
-        """Whether what is loaded is fitted with it beside, as it is no error of the arm.
+        """Whether the loaded result is fitted with this effect, as it is none of the arm.
 
         Where it may be nothing, lengths and offsets that imitate it may be right.
         """
@@ -178,7 +181,7 @@ def _later(remedy: str) -> str:
 
 
 def with_sizes(cause: str, sizes: Sequence[str]) -> str:
-    """Return the sentence of a cause with what it amounts to behind its first full stop."""
+    """Return the sentence of a cause with its sizes inserted before the first full stop."""
     if not sizes:
         return cause
     first, stop, rest = cause.partition('. ')
@@ -506,7 +509,7 @@ def shares(
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """What fits of some of the causes leave of some rows.
+    """Normal equations for fits of some of the causes, and their residuals in some rows.
 
     The equations of base and candidates; products of what they displace in the rows to judge, and
     of the errors there, m²; places of the base columns, and those of each cause.

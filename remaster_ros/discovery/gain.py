@@ -24,7 +24,7 @@ GROSS = 7.0
 
 @dataclass(frozen=True)
 class Gain:
-    """RMS of the 3-D error over all validation rows, m; None where there are none."""
+    """RMS of the 3-D error over all validation rows, m; None without such rows."""
 
     # With offsets only, and with the effects
     held_out_rms_before_m: float | None
@@ -126,7 +126,7 @@ def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, f
 
 
 def _p_value_ranks(some: FloatArray, others: FloatArray) -> float:
-    """Return how probable it is by chance that two columns rank as alike (Spearman), or as unlike.
+    """Return the p-value of a rank correlation (Spearman), two-sided; 1 for under 3 rows.
 
     By Student's t, as SciPy has it, whose statistics take 0.4 s to import.
     """

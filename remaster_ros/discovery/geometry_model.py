@@ -81,12 +81,12 @@ class GeometryModel:
 
     @property
     def drawing_held_out_m(self) -> float:
-        """The same on the drawing."""
+        """Mean error of held-out rows by the drawing, m."""
         return mean_length(self.drawing_errors[self.judged])
 
     @property
     def is_better(self) -> bool:
-        """Whether held-out poses are predicted plainly better with it than on the drawing.
+        """Whether this model predicts held-out poses clearly better than the drawing.
 
         Each pose counts once, as its rows err together. A tie goes to the drawing: an arm with
         nothing but offsets gains or loses by chance.
@@ -101,7 +101,7 @@ class GeometryModel:
         return bool(gains.mean() > PLAINLY * gains.std(ddof=1) / np.sqrt(len(poses)))
 
     def beside(self, alone: FitResult, gross: Sequence[int]) -> GeometryModel:
-        """Return it judged beside the zero-offsets that can be loaded in place of it.
+        """Return this model judged against a fit of the zero-offsets that can be loaded instead.
 
         Parameters
         ----------
@@ -114,7 +114,10 @@ class GeometryModel:
         return replace(self, drawing_errors=alone.residuals_after, judged=self.judged & counts)
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
-        """Return stds of offsets, given the drawing (k,), as they are if it is not exact."""
+        """Return standard deviations of offsets, (k,), without the assumption of an exact drawing.
+
+        ``std``: given an exact drawing, (k,).
+        """
         moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
         return moved
 
@@ -227,7 +230,7 @@ def mean_length(errors: FloatArray) -> float:
 
 
 def _fitted(found: Estimate, causes: Sequence[Candidate]) -> Estimate | None:
-    """Return the fit with some causes beside it; None where they cannot be fitted."""
+    """Return the fit with some causes as parameters; None if they cannot be fitted."""
     if not causes:
         return found
     data = Residuals.of(found)
@@ -283,7 +286,7 @@ def _tilts(context: Context) -> list[Candidate]:
 
 
 def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
-    """Return what a weight of each member does to the zero-offsets, rad or m per m, (k, m)."""
+    """Return the change of the zero-offsets per weight of each member, rad or m per m, (k, m)."""
     free = found.posterior.free
     known = data.full_jacobian[data.rows.source][:, :, free]
     x = found.model.natural(found.mode.z)

@@ -40,7 +40,7 @@ class Unexplained:
 
 
 def suggested(effects: Sequence[FoundEffect]) -> str:
-    """Return causes in a few words, each with its joint, its place and its minute."""
+    """Return causes in a few words, each with its joint, place and minute; '' for none."""
     words = []
     for effect in effects:
         word = sentence_case(effect.title)
@@ -60,7 +60,7 @@ def is_harmful(gain: Gain) -> bool:
 def harm_of(
     found: Estimate, fit: FitResult, gain: Gain, effects: Sequence[FoundEffect]
 ) -> Unexplained:
-    """Return what is left unexplained where causes are discarded because they do harm."""
+    """Return the unexplained error if causes are discarded because they do harm."""
     measurements = found.problem.measurements
     rows = measurements.is_validation
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
@@ -98,7 +98,10 @@ def harm_of(
 def unfitted(
     errors: FloatArray, effects: Sequence[FoundEffect], reason: InsufficientDataError
 ) -> Unexplained:
-    """Return what is left of errors (n, 3), m, where causes cannot be fitted with all else."""
+    """Return the unexplained error if causes cannot be fitted together with all else.
+
+    ``errors``: residuals, m, (n, 3).
+    """
     names = suggested(effects)
     return Unexplained(
         where='residuals',
@@ -114,7 +117,7 @@ def unfitted(
 
 
 def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained:
-    """Return what is left unexplained where errors are there and no cause stands out of them.
+    """Return the unexplained error if errors are present, but no cause stands out.
 
     Of the model of all kinds of errors, by members; a p-value of gaining as much by chance.
     """

@@ -83,7 +83,7 @@ def moved_markers(
 
 
 def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
-    """Return priors that let markers go as far as they were found to be; None if none moved."""
+    """Return priors as wide as the markers' found offsets; None if no marker moved."""
     places = {}
     for effect in moved:
         if effect.name == MARKER_OFFSET.name:
@@ -110,7 +110,7 @@ def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolAr
 
 
 def _projected(others: FloatArray, own: FloatArray) -> FloatArray:
-    """Return what of some columns others explain, which may depend on each other."""
+    """Return the projection of columns `own` on the span of `others`, which may be dependent."""
     scale = np.linalg.norm(others, axis=0)
     unit = others / np.where(scale > 0.0, scale, 1.0)
     # By pivoted QR: the singular values would take three times as long.

@@ -76,7 +76,7 @@ def structure_left(
 
 @dataclass(frozen=True, eq=False)
 class _Checks:
-    """The checks of one session of n rows."""
+    """Checks of a session's n rows for errors that no cause explains."""
 
     data: Residuals
     solution: Solution
@@ -156,7 +156,10 @@ class _Checks:
         )
 
     def _share_near(self, row: int) -> float:
-        """Return the share of places of other poses that a reading lies near, at least one's."""
+        """Return the share of other poses at which the sensor would have had this reading.
+
+        At least that of one pose.
+        """
         measurements = self.data.context.measurements
         others = (measurements.sensor == measurements.sensor[row]) & (
             measurements.pose != measurements.pose[row]
@@ -212,7 +215,7 @@ class _Checks:
             )
 
     def _moved(self, sensor: int) -> str:
-        """Return from when on a sensor's errors are others than before; '' if they are not."""
+        """Return a sentence on the moment since which a sensor's errors are different, or ''."""
         context = self.data.context
         rows = np.flatnonzero(context.sensor == sensor)
         moved = None

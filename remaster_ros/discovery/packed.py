@@ -24,7 +24,7 @@ def length(size: int) -> int:
 
 
 def diagonal(size: int) -> IntArray:
-    """Return where the diagonal is, (size,)."""
+    """Return the indices of the diagonal in a packed matrix, (size,)."""
     return np.cumsum(np.arange(1, size + 1)) - 1
 
 

@@ -36,7 +36,7 @@ LEAST_SHARE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """All members of one kind of error."""
+    """Random effects of one kind of error, with one variance for all members."""
 
     candidate: Candidate  # Of the weights of all members, m, with a penalty of one
     members: tuple[Candidate, ...]  # The candidates that displace a marker
@@ -61,7 +61,7 @@ class Family:
         least: float = 0.0,
         alike: Sequence[Candidate] = (),
     ) -> Family | None:
-        """Make the family of some candidates; None where none of them displaces a marker.
+        """Make the family of some candidates; None if none of them displaces a marker.
 
         Its weights have a standard deviation of no less than ``least``, m. ``alike``: candidates
         whose joints move the marker as much as theirs count to; the members by default.
@@ -158,7 +158,7 @@ def kinds(
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
-    """Return a solution with the members of its families in the place of these.
+    """Return a solution with its families replaced by their members.
 
     The same fit: each member has the prior that the family gives it.
     """
@@ -206,7 +206,7 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
 
 
 def _diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return a matrix with these on its diagonal."""
+    """Return the block-diagonal matrix of blocks, which need not be square."""
     rows = np.cumsum([0, *(block.shape[0] for block in blocks)])
     columns = np.cumsum([0, *(block.shape[1] for block in blocks)])
     result = np.zeros((rows[-1], columns[-1]))

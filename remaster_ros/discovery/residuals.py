@@ -75,12 +75,12 @@ class Residuals:
 
     @classmethod
     def of(cls, found: Estimate) -> Residuals:
-        """Take over a fit with offsets: its residuals on the rows it kept."""
+        """Residuals of a fit with offsets at its mode, on the rows that it kept."""
         return cls.at(found, found.mode)
 
     @classmethod
     def at(cls, found: Estimate, mode: Mode) -> Residuals:
-        """Take over the rows a fit kept, with the residuals of another mode of its model."""
+        """Residuals of a fit with offsets at another mode of its model, on the rows it kept."""
         problem, model = found.problem, found.model
         x = model.natural(mode.z)
         context = Context(
@@ -133,7 +133,10 @@ class Residuals:
         )
 
     def holding(self, parameters: IntArray) -> Residuals:
-        """Return the same where some parameters (of ``full_jacobian``) absorb nothing."""
+        """Return the residuals with some natural parameters fixed, so that these absorb nothing.
+
+        ``parameters``: their columns in ``full_jacobian``.
+        """
         jacobian = np.delete(self.full_jacobian, parameters, axis=2)
         combinations = _orthonormal(jacobian[self.rows.source])
         full_base = jacobian @ combinations
@@ -145,12 +148,12 @@ class Residuals:
         )
 
     def less(self, shift: FloatArray) -> Residuals:
-        """Return the same with displacements (all rows, 3), m, taken off the errors."""
+        """Return the residuals with displacements subtracted; ``shift``: m, (all rows, 3)."""
         left = self.full_errors - shift
         return replace(self, full_errors=left, errors=left[self.rows.source])
 
     def only(self, source: IntArray) -> Residuals:
-        """Return the same on other rows of the session."""
+        """Return the residuals on other rows; ``source``: their indices among all rows."""
         rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
         rows = rows.along_path(self.path_noise)
         return replace(
@@ -175,7 +178,7 @@ class Residuals:
 
     @cached_property
     def _displacements(self) -> dict[Candidate, FloatArray]:
-        """What `columns` has computed so far: a search fits the same few again and again."""
+        """Cache of `columns` by candidate: a search fits few candidates again and again."""
         return {}
 
     @cached_property
@@ -190,7 +193,7 @@ class Residuals:
         return int(self.pose_of_row.max()) + 1
 
     def columns(self, candidates: Sequence[Candidate]) -> FloatArray:
-        """Return what a unit of each parameter displaces in the rows worked on, (n, 3, c)."""
+        """Return displacements by a unit of each parameter in the rows worked on, m, (n, 3, c)."""
         kept = self._displacements
         for candidate in candidates:
             if candidate not in kept:
@@ -233,7 +236,7 @@ class Residuals:
         return norms[order], packed.picked(grams, order)
 
     def _positions(self, known: Sequence[Candidate], candidates: Sequence[Candidate]) -> IntArray:
-        """Return where base, errors and candidates are among the columns of a set of `_grams`."""
+        """Return the columns of base, errors and candidates in Gram matrices of `known`."""
         count = self.base.shape[2] + 1
         first = dict(
             zip(known, np.cumsum([count, *(candidate.size for candidate in known)]), strict=False)
@@ -267,7 +270,7 @@ class Residuals:
         return norms, grams
 
     def displaced(self, candidates: Sequence[Candidate], parameters: FloatArray) -> FloatArray:
-        """Return what candidates with these parameters displace in every row, m, (all rows, 3)."""
+        """Return the displacement by candidates in every row of the session, m, (all rows, 3)."""
         shift = np.zeros((len(self.context), 3))
         for where, context in self.context.blocks():
             start = 0
@@ -278,12 +281,12 @@ class Residuals:
         return shift
 
     def unexplained(self, fit: Fit) -> FloatArray:
-        """Return what a fit leaves of the errors in every row of the session, m, (all rows, 3)."""
+        """Return the residuals of a fit in every row of the session, m, (all rows, 3)."""
         left: FloatArray = self.full_errors - self.full_base @ fit.base
         return left - self.displaced(fit.candidates, fit.parameters)
 
     def left(self, fit: Fit) -> FloatArray:
-        """Return the same in the rows worked on, m, (n, 3)."""
+        """Return the residuals of a fit in the rows worked on, m, (n, 3)."""
         explained: FloatArray = (
             self.base @ fit.base + self.columns(fit.candidates) @ fit.parameters
         )
@@ -291,7 +294,7 @@ class Residuals:
 
 
 def units(candidates: Sequence[Candidate], norms: FloatArray) -> FloatArray:
-    """Return the units of the columns of candidates, in which a fit has them, (c,).
+    """Return the scale of each column of candidates, (c,).
 
     The norms of columns; where they are 0, 1. The penalty compares neighbours: one unit for all of
     a candidate's splines, also for those at the edge, where no row has more than a rounding error.

@@ -24,7 +24,7 @@ class Covariances:
 
     @cached_property
     def both(self) -> tuple[FloatArray, FloatArray]:
-        """What `compute` returns."""
+        """Both covariances, as returned by `compute`."""
         return self.compute()
 
 
@@ -53,7 +53,7 @@ class Solution:
         return self.full_covariance[len(self.base) :, len(self.base) :]
 
     def slices(self) -> list[slice]:
-        """Return where each candidate's parameters are."""
+        """Return the slice of each candidate's parameters."""
         edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 

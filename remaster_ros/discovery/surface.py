@@ -75,12 +75,12 @@ class Block:
 
     @property
     def log_prior(self) -> float:
-        """Log prior odds that it is in a model, at one of its levels, if its kind is there."""
+        """Log prior odds of the block at one level, if its kind is in the model."""
         return -float(np.log(self.candidate.drawn_from * self.allowed.sum()))
 
     @property
     def sign(self) -> int:
-        """Sign of its weight that physics allows; 0 for both."""
+        """Sign of the weight that physics allows; 0 for both signs."""
         return self.candidate.sign if self.size == 1 else 0
 
     def displacement(self, context: Context) -> FloatArray:
@@ -93,7 +93,7 @@ class Block:
         return {}
 
     def weights(self, level: int) -> Candidate:
-        """Return a candidate of its weights, with the prior of a level."""
+        """Return the block's weights as a candidate, with the prior of a level."""
         if level not in self._weights:
             self._weights[level] = Candidate(
                 name=self.candidate.name,
@@ -158,7 +158,7 @@ class Pool:
         self.extend(blocks)
 
     def extend(self, blocks: Sequence[Block]) -> None:
-        """Add blocks behind the others."""
+        """Append blocks to the pool, with their columns."""
         self.blocks += blocks
         self.sizes = np.array([block.size for block in self.blocks], dtype=np.int64)
         ends = np.cumsum([0, *self.sizes])
@@ -202,7 +202,7 @@ class Pool:
 
 
 class Surface:
-    """The log posterior over models with noise and background as they are.
+    """Log posterior over models, with noise and background fixed.
 
     Columns and errors are whitened, and what the offsets model and the background absorb is taken
     out: by M with M'M = (I + Z D Z')⁻¹ for the background Z with variances D, and by projection
@@ -320,13 +320,13 @@ class State:
 
     @cached_property
     def places(self) -> list[slice]:
-        """Where the weights of each block of the model are."""
+        """Slice of the weights of each block of the model."""
         ends = np.cumsum([0, *(self.surface.pool.sizes[block] for block, _ in self.model)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
     @cached_property
     def gains(self) -> FloatArray:
-        """What each block at each level adds to the log posterior, (blocks, levels).
+        """Gain in log posterior by adding each block at each level, (blocks, levels).
 
         Of blocks of several weights by the diagonal of their Gram matrix, until `with_block`
         has the exact value.
@@ -346,7 +346,7 @@ class State:
 
     @cached_property
     def losses(self) -> FloatArray:
-        """What the log posterior loses without each block of the model."""
+        """Loss in log posterior by leaving out each block of the model, (blocks of the model,)."""
         lost, pool = [], self.surface.pool
         for (block, level), where in zip(self.model, self.places, strict=True):
             covariance, mean = self.inverse[where, where], self.weights[where]

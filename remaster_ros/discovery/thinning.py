@@ -31,7 +31,7 @@ FEWEST_ROWS = 2
 
 @dataclass(frozen=True)
 class Thinning:
-    """Which rows were searched, and how the causes hold on the others."""
+    """Number of rows searched, and errors with the causes on all other rows."""
 
     # Rows that were searched, and all that could have been
     searched: int
@@ -78,7 +78,7 @@ def draw_rows(
 
 
 def of_spread_poses(measurements: Measurements, rows: IntArray) -> IntArray:
-    """Return the given rows, of many those of evenly spread poses, about `MOST_ROWS`."""
+    """Return about `MOST_ROWS` of the given rows, of evenly spread poses; all if fewer."""
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
     kept = evenly(int(pose.max(initial=-1)) + 1, MOST_ROWS / max(MOST_ROWS, len(rows)))
     return rows[np.isin(pose, kept)]

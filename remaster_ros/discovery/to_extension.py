@@ -15,7 +15,7 @@ from remaster_ros.types import FloatArray
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
-    """Return the candidates of a solution as further parameters, linearised where it has them."""
+    """Return a solution's candidates as parameters of the model, linearised at their values."""
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))
     for candidate, where in zip(solution.candidates, solution.slices(), strict=True):

@@ -92,12 +92,12 @@ def identity(candidate: Candidate) -> Identity:
 
 
 def at_any_time(candidate: Candidate) -> Identity:
-    """Return which cause a candidate is, whether it changes in mid-session or not."""
+    """Return a candidate's identity, without the moment at which it changes."""
     return *identity(candidate)[:-1], 'at any time'
 
 
 def _claims(candidate: Candidate) -> Identity:
-    """Return what has to be in a model for a cause to be there.
+    """Return the identity by which a cause counts as present in a model.
 
     What is there from the start is there in a model, too, in which it comes or goes near an end.
     """
@@ -107,7 +107,10 @@ def _claims(candidate: Candidate) -> Identity:
 def at_other_moments(
     candidate: Candidate, context: Context, low: float, high: float
 ) -> list[Candidate]:
-    """Return what happened in the place of a candidate in the gaps between two moments, s."""
+    """Return variants of a candidate that happened in gaps between `low` and `high`, s.
+
+    [] for a candidate that did not happen at a moment.
+    """
     between, changes = EFFECTS[candidate.name].between, EFFECTS[candidate.name].changes
     if candidate.changes is not None and changes is not None:
         found = [
@@ -127,7 +130,7 @@ def at_other_moments(
 
 
 def p_value(log_evidence_gain: float) -> float:
-    """Return the largest probability that anything gains so much where nothing is there.
+    """Upper bound on the probability of such a gain in log evidence in pure noise.
 
     Candidates of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one of c
     candidates of it, the sum of all Bayes factors has the expectation 1 where nothing is there; by
@@ -171,7 +174,7 @@ class Evaluated:
 
     @cached_property
     def where(self) -> dict[Candidate, slice]:
-        """Where the weights of each candidate are."""
+        """Slice of the weights of each candidate in `estimate`."""
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return {
@@ -217,7 +220,7 @@ class Evaluated:
 
     @cached_property
     def standing_out(self) -> dict[Candidate, float]:
-        """Probability of each member of the background that it is there, given the model.
+        """Probability that each member of the background is present, given the model.
 
         The kind has to be there, and among its m causes this one, at odds of 1 to m - 1.
         """
@@ -287,7 +290,7 @@ def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]
 
 
 def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
-    """Return kinds of errors in which each free form is one by itself."""
+    """Return the families with each free form (penalised member) as a family of its own."""
     found = []
     for family in families:
         if family.members[0].penalty is None:
@@ -315,7 +318,7 @@ def log_price(families: Sequence[Family]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """What one chain ended with."""
+    """Result of one chain."""
 
     best: Evaluated  # Its best model
     visited: Mapping[Model, float]  # Log posterior of the models of its last round
@@ -392,7 +395,7 @@ class Walk:
         self._weigh()
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
-        """Add the changes that a best model may have; return it with the best of them.
+        """Add changes to the pool; return the best models, each with its most likely change.
 
         Beside the model and in the place of each of its blocks, also without a wander: that
         follows whatever changes. Changes are many and hardly ever there: their columns are worked
@@ -428,7 +431,7 @@ class Walk:
         return found
 
     def _refined(self) -> bool:
-        """Add candidates near those of the best model; return whether there are any.
+        """Add candidates near those of the best model; return whether any were added.
 
         At other moments, and of what has a place that no parameter is.
         """
@@ -590,7 +593,7 @@ class Walk:
                 break
 
     def _whole(self, model: Model, start: Evaluated | None) -> Evaluated | None:
-        """Return a model with the kinds of the background chosen anew among all."""
+        """Return a model with the background chosen anew among all kinds; None if not fitted."""
         if model not in self._wholes:
             tried = [
                 self._shown(found)
@@ -638,7 +641,7 @@ class Walk:
         return self.evaluate(tuple(sorted({*found.model, *more})), found) if more else None
 
     def _weigh(self) -> None:
-        """Weigh the models visited, those that matter at their own noise and background."""
+        """Compute the shares of the models visited; likely models at their own noise."""
         pooled: dict[Model, float] = {}
         for chain in self.chains:
             for model, value in chain.visited.items():
@@ -669,7 +672,7 @@ class Walk:
 
     @cached_property
     def independent_share(self) -> float:
-        """Number of independent readings over that of all, by what successive poses remember.
+        """Share of the readings that count as independent, by the autocorrelation of errors.
 
         With the correlation r of successive errors, (1 - r) / (1 + r) (Bartlett 1946): what the
         best model leaves, and what wanders with the sensor. 1 where r may be chance.
@@ -695,7 +698,9 @@ class Walk:
         return 1.0 if r < 2.0 / np.sqrt(3.0 * len(one)) else (1.0 - r) / (1.0 + r)
 
     def log_gain(self, causes: Sequence[Candidate], share: float = 1.0) -> float:
-        """Return what the log posterior of the best model would lose without some causes of it.
+        """Return the loss in log posterior of the best model by leaving out some causes of it.
+
+        ``share``: share of the readings that are independent.
 
         ``share``: of the readings that are independent.
         """
@@ -729,7 +734,7 @@ class Walk:
         return self.solutions[0][0]
 
     def _exchanges(self, best: Evaluated) -> dict[Model, float]:
-        """Return what is nearly as likely as a model with one block exchanged for another.
+        """Return log posteriors of models that are nearly as likely with one block exchanged.
 
         A chain visits few of them, and look-alikes are among these.
         """
@@ -789,9 +794,9 @@ class Walk:
         return bool(np.sum(rest**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
 
     def instead_of(self, group: Sequence[Candidate]) -> dict[Candidate, float]:
-        """Return what models have in the place of some causes of the best one, by probability.
+        """Return the candidates that models have in place of some causes, with probabilities.
 
-        Of models that have none of them: what is not in the best model.
+        Of models with none of these causes; candidates that the best model lacks.
         """
         mine = {_claims(candidate) for candidate in group}
         best = {identity(candidate) for candidate in self.named(self.models[0])}
@@ -820,7 +825,7 @@ class Walk:
         return found
 
     def present(self, model: Evaluated) -> dict[Candidate, float]:
-        """Return the candidates of a model with the probability that each is there, given it."""
+        """Return the probability of each candidate of a model to be present, given the model."""
         blocks = {self.pool.blocks[block].candidate: 1.0 for block, _ in model.model}
         have = {name for candidate in blocks for name in candidate.parameters}
         out = {
@@ -831,11 +836,11 @@ class Walk:
         return blocks | out
 
     def named(self, model: Evaluated) -> list[Candidate]:
-        """Return the candidates that are rather there than not, given a model."""
+        """Return the candidates whose probability in a model is at least 1/2."""
         return [candidate for candidate, chance in self.present(model).items() if chance >= 0.5]
 
     def solution(self, model: Evaluated) -> Solution:
-        """Return a model by the parameters of its candidates, blocks and background together.
+        """Return a model as a solution in its candidates' parameters, blocks with background.
 
         A cause that is a member of the background, too, has the sum of both: its size is not
         shrunk by the variance of its kind.

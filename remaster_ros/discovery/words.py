@@ -44,7 +44,7 @@ MOST_STATED = 0.99
 
 
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
-    """Return value, standard deviation and unit of a parameter as people read them."""
+    """Return value, standard deviation and unit of a parameter as text, in usual units."""
     words, times = SHOWN_UNITS.get(unit, (unit, 1.0))
     if unit == 's' and abs(value) >= LONG_S:
         words, times = 'min', 1.0 / 60.0
@@ -108,7 +108,7 @@ def titled(candidate: Candidate, joints: Sequence[int]) -> str:
 
 
 def place_words(candidate: Candidate) -> str:
-    """Return where an error enters: 'joint angle', 'joint position' of one that slides."""
+    """Return the place of an error: 'joint angle', or 'joint position' of a prismatic joint."""
     return 'joint position' if candidate.slide else candidate.place.replace('_', ' ')
 
 
@@ -118,7 +118,7 @@ def sentence_case(title: str) -> str:
 
 
 def called(name: str, joints: Sequence[int]) -> str:
-    """Return an effect as people call it: 'link length of joints 2 and 3'."""
+    """Return an effect's name for people: 'link length of joints 2 and 3'."""
     words = name.replace('_', ' ')
     return f'{words} of {joint_words(joints)}' if joints else words
 
@@ -129,5 +129,5 @@ def joint_words(joints: Sequence[int]) -> str:
 
 
 def part_words(name: str, joints: Sequence[int], other: str, of: Sequence[int]) -> str:
-    """Return 'joint 2 alone' where another effect is the same of fewer joints, else ''."""
+    """Return 'joint 2 alone' if another effect is of the same kind with fewer joints, else ''."""
     return f'{joint_words(of)} alone' if other == name and set(of) < set(joints) else ''

@@ -96,11 +96,11 @@ class MotionLimits:
 
     @property
     def margins(self) -> FloatArray:
-        """Distance kept from the limits of each joint, rad or m, (k,); (1,) where all turn."""
+        """Margin to the limits of each joint, rad or m, (k,); (1,) if all joints turn."""
         return self.margin * self.units.per_radian
 
     def shown(self, joint: int, low: float, high: float) -> str:
-        """Return limits of a joint as people read them."""
+        """Return two limits of a joint as text, in degrees or mm."""
         first, last = (self.units.in_degrees(joint, value) for value in (low, high))
         return f'[{first.split()[0]}, {last.split()[0]}] {last.split()[1]}'
 

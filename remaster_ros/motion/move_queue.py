@@ -58,11 +58,11 @@ class MoveQueue:
         self._refused = refused
 
     def found(self, finding: Finding) -> None:
-        """Process what is found out about where the arm is."""
+        """Process a finding about the arm's place, by the table `states.PLACE`."""
         self.place = after(PLACE, self.place, finding)
 
     def clear_halt(self) -> None:
-        """Process that a person has cleared a halt, and so allowed the way out that it offered."""
+        """Process that a person has cleared a halt, which allows the way out that was offered."""
         self._way_out, self._offered = self._offered, None
         self.found(Finding.CLEARED if self._way_out is None else Finding.ALLOWED)
 
@@ -75,7 +75,7 @@ class MoveQueue:
 
     @property
     def target(self) -> FloatArray | None:
-        """The next configuration, rad or m, (k,); None where none is left."""
+        """Next configuration, rad or m, (k,); None after the last one."""
         return self._solutions[self.next] if self.next < len(self._solutions) else None
 
     @property

@@ -88,7 +88,10 @@ class PointSpeeds:
         return np.sqrt(fastest)
 
     def peak_m(self, start: FloatArray, end: FloatArray) -> float:
-        """Return the fastest point's peak speed where the line takes a second, m/s."""
+        """Return the fastest point's peak speed along a line that takes one second, m/s.
+
+        ``start, end``: joint positions, rad or m, (k,).
+        """
         way = end - start
         count = 3 + int(np.max(np.abs(way) / self._per_radian) / PEAK_STEP_RAD)
         q = start + np.linspace(0.0, 1.0, count)[:, None] * way
@@ -100,7 +103,9 @@ class PointSpeeds:
 
 
 def _carried(T: FloatArray) -> FloatArray:
-    """Return what takes turn and velocity, as a row, from a frame to one fixed at T (4, 4) in it.
+    """Return the matrix (6, 6) from a frame's turn and velocity to those of a frame fixed in it.
+
+    ``T``: the fixed frame, (4, 4). To be multiplied from the right to rows of turn and velocity.
 
     Its origin moves with v + w × p.
     """
@@ -110,9 +115,10 @@ def _carried(T: FloatArray) -> FloatArray:
 
 
 def _velocities(points: FloatArray) -> FloatArray:
-    """Return what takes turn and velocity of a frame, as a row, to those of points (n, 3) in it.
+    """Return the matrix (6, 3 n) from a frame's turn and velocity to velocities of points.
 
-    Returns (6, 3 n), the points' x, then y, then z.
+    ``points``: fixed in the frame, (n, 3). To be multiplied from the right; columns are the
+    points' x, then y, then z.
     """
     across = np.cross(np.eye(3)[:, None], points)
     by_turn = np.moveaxis(across, 1, 2).reshape(3, -1)

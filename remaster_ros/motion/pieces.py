@@ -64,24 +64,24 @@ class Piece:
 
     @property
     def end(self) -> FloatArray:
-        """Where it ends, rad or m, (k,)."""
+        """Joint positions at the end of the piece, rad or m, (k,)."""
         return self.waypoints[-1].q
 
     @property
     def end_s(self) -> float:
-        """When it ends, s from the trajectory's start."""
+        """Time of the end, s from the trajectory's start."""
         return self.waypoints[-1].time_s
 
     @property
     def is_last(self) -> bool:
-        """Whether it ends with the trajectory."""
+        """Whether the piece ends with the trajectory."""
         return not np.isfinite(self.cut_s)
 
 
 def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
-    """Return what is sent at a time of a trajectory, s from its start.
+    """Return the piece of a trajectory to be sent at a time, s from its start.
 
-    ``horizon_s``: it is over so much later, s.
+    ``horizon_s``: time from then to the piece's end, s.
     """
     piece = _piece(trajectory, sent_s, horizon_s)
     following = _piece(trajectory, sent_s + RENEWED_S, horizon_s)[0]
@@ -89,7 +89,7 @@ def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
 
 
 def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
-    """Return the trajectory along the same lines with a rest after `horizon_s` at the latest."""
+    """Return a trajectory along the same lines that rests every `horizon_s` at the latest."""
     lines: list[Line] = []
     for line in trajectory.lines:
         count = max(int(np.ceil((1.0 / line.rate) / (horizon_s - RAMP_S) - SAME_S)), 1)

@@ -18,7 +18,7 @@ by up to half a second may make the two sides see different differences, and one
 
 
 class DuplicateNodeCheck:
-    """Whether a node has a rival, and whether it must give way.
+    """Finds other nodes of the same name, and decides which of them has to give way.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class DuplicateNodeCheck:
         self._uptimes_s: dict[str, float] = {}
 
     def update_own(self, now_s: float) -> None:
-        """Process this node's own summary: that it came back shows that this node receives any."""
+        """Process the receipt of this node's own summary: it would receive others', too."""
         if self.alone_since_s is None:
             self.alone_since_s = now_s
 

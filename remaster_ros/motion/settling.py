@@ -16,7 +16,7 @@ SettleState = Literal['moving', 'elsewhere', 'settling', 'settled']
 
 @dataclass(frozen=True)
 class SettleRules:
-    """What counts as arrived and as still.
+    """Tolerances and times by which an arm has arrived and stands still.
 
     Of a joint that slides the tolerances are 0.25 m times as much (`JointUnits`), by default 0.5
     and 0.05 mm: as near as that at which a joint that turns has a point 0.25 m from its axis.
@@ -74,7 +74,7 @@ class SettleDetector:
         return 'settled' if waited else 'settling'
 
     def _goes_on(self, stamp: float, q: FloatArray) -> _Standstill | None:
-        """Return the standstill with another report; None if it has ended, or was not seen."""
+        """Return the standstill extended by a report; None if it has ended or has not begun."""
         still = self._still
         if still is None or not 0.0 <= stamp - still.last <= self.rules.max_gap_s:
             return None

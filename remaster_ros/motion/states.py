@@ -80,7 +80,7 @@ class Then:
 
 
 def _always(state: Arm) -> dict[Event, Then]:
-    """Return what is the same in most states: a halt, and that a reason to stop needs no stop."""
+    """Return the rows of most states: a halt halts, and a stop needs no command."""
     return {
         Event.STOP: Then(state),
         Event.HALT: Then(Arm.HALTED, (Halted,)),
@@ -89,7 +89,7 @@ def _always(state: Arm) -> dict[Event, Then]:
 
 
 def _commanded(state: Arm) -> dict[Event, Then]:
-    """Return what is the same in the two states in which a stop is commanded."""
+    """Return the rows of the two states with a move under way, where a stop is commanded."""
     return {
         **_always(state),
         Event.STOP: Then(Arm.BRAKES, (Stop,)),
@@ -257,5 +257,5 @@ E = TypeVar('E', bound=StrEnum)
 
 
 def after(table: Mapping[S, Mapping[E, S]], state: S, event: E) -> S:
-    """Return the state that follows; the same where the table has no row."""
+    """Return the state after an event; unchanged if the table has no row for the event."""
     return table[state].get(event, state)

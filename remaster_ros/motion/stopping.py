@@ -38,10 +38,10 @@ ROUNDS = 32
 
 
 def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) -> Waypoint:
-    """Return where and when an arm on a line comes to rest that is to stop now.
+    """Return position and time at which an arm on a line comes to rest if it stops now.
 
-    ``low_s, high_s``: the arm is where the line is at some time from `low_s` to `high_s`, s since
-    its start; ``limits``: for the accelerations.
+    ``low_s, high_s``: the arm's place is that of the line at a time between these, s since its
+    start; ``limits``: for the accelerations.
     """
     stretch = _Stretch(line, low_s, high_s, limits)
     longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))
@@ -95,7 +95,7 @@ class _Stretch:
         return 3 * gap - 2 * v, v - 2 * gap
 
     def _acceleration(self, time: float, end: float) -> float:
-        """Return the largest acceleration, as a share of what is allowed."""
+        """Return the largest acceleration of a stop, as a share of its limit."""
         second, third = self._coefficients(time, end)
         largest = np.maximum(np.abs(2 * second), np.abs(2 * second + 6 * third))
         return float(np.max(largest)) / time**2 * self._hardness

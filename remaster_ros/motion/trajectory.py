@@ -100,7 +100,7 @@ class Line:
         return tuple(points)
 
     def share(self, time_s: float) -> tuple[float, float]:
-        """Return which share of the way is gone at a time, and its rate, 1/s."""
+        """Return the share of the line covered at a time, and its rate, 1/s."""
         # The speed goes up from the start, and down by as much from where it is to be lost.
         up, gone_up = _ramp(time_s)
         down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
@@ -147,12 +147,12 @@ class Trajectory:
 
     @property
     def start(self) -> FloatArray:
-        """Where it begins, rad, (k,)."""
+        """Joint positions at the start, rad or m, (k,)."""
         return self.lines[0].start
 
     @property
     def end(self) -> FloatArray:
-        """Where it ends, rad, (k,)."""
+        """Joint positions at the end, rad or m, (k,)."""
         return self.lines[-1].end
 
     @property
@@ -181,7 +181,7 @@ class Trajectory:
         return index, time_s - self.starts_s[index]
 
     def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
-        """Return where the arm should be (rad) and how fast (rad/s), (k,) each."""
+        """Return joint positions, rad or m, and velocities, per s, at a time, (k,) each."""
         index, since_s = self.line_at(time_s)
         line = self.lines[index]
         share, rate = line.share(since_s)

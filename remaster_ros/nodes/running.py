@@ -176,7 +176,7 @@ def _place_of(error: Exception) -> str:
 
 
 def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the callback of a service, one that waits for others or not, with `failed`."""
+    """Return a service's callback, sync or async, whose exceptions become `failed` responses."""
 
     @wraps(callback)
     async def serve(request: Any, response: Any) -> Any:
@@ -192,7 +192,7 @@ def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[...
 def _leaving_out(
     node: RemasterNode, topic: str, callback: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return the callback of a topic, which leaves out a message that it refuses."""
+    """Return a topic's callback that reports a message with an InputError, and drops it."""
 
     @wraps(callback)
     def take(*message: Any) -> Any:
@@ -261,7 +261,7 @@ class OneThread(_Takes, SingleThreadedExecutor):
 
 
 class _Threads(_Takes, MultiThreadedExecutor):
-    """rclpy's, but it waits for the callbacks under way before it takes their guards away."""
+    """Executor of several threads that waits at its end for the callbacks under way."""
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop executing callbacks and wait for their end."""

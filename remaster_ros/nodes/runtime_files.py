@@ -101,7 +101,7 @@ class NameLock:
 
 
 def page_name(domain: int, node: str) -> str:
-    """Return what the files of the page are called that ``/left/watch``, say, serves."""
+    """Return the name of a live page's files; ``node``: full name, such as ``/left/watch``."""
     return f'domain_{domain}{node.replace("/", ".")}'
 
 

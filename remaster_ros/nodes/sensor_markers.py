@@ -136,7 +136,10 @@ class MeasureService:
             self._commanded.set()
 
     def _expected(self, marker: str = '') -> FloatArray | None:
-        """Where a marker should be in the sensor's frame; None before registration."""
+        """Expected position of a marker in the sensor's frame, m, (3,).
+
+        None before registration, or before the first joint states.
+        """
         if self._T_N_R is None or self._T_R_T is None:
             return None
         return transforms.apply(self._T_N_R @ self._T_R_T, self._markers_T[marker])
@@ -189,13 +192,16 @@ class MeasureService:
         return response
 
     def _order(self) -> list[str]:
-        """Return the markers that can be measured now, that of the last reading first."""
+        """Return the markers to measure, that of the last reading first.
+
+        [''], which leaves the choice to the driver, before registration or joint states.
+        """
         if self._expected() is None:
             return ['']
         return [self._last, *(name for name in self._markers_T if name != self._last)]
 
     def _measure(self, marker: str) -> float:
-        """Measure a marker once and publish it; return its stamp, s."""
+        """Measure a marker once, publish the reading and its temperature; return its stamp, s."""
         expected = self._expected(marker)
         if len(self._markers_T) > 1 and expected is not None:
             self._driver.turn_to(marker, expected)
@@ -206,7 +212,7 @@ class MeasureService:
         return reading.stamp_s
 
     def _publish_temperature(self, reading: MarkerReading) -> None:
-        """Publish it under the reading's stamp, before the point."""
+        """Publish a reading's temperature under the reading's stamp; nothing if it has none."""
         if not math.isfinite(reading.temperature_c):
             return
         message = Temperature(temperature=float(reading.temperature_c))

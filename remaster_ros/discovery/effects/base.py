@@ -40,7 +40,7 @@ NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """What one unit of each of m parameters does to each of n rows."""
+    """Displacements, or added joint positions, in n rows by one unit of each of m parameters."""
 
     at: int | None  # Index of the joint whose angle it adds to; None where it displaces the marker
     # Added joint angle, rad or m per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
@@ -60,7 +60,7 @@ class Design:
 
 @dataclass(frozen=True, eq=False)
 class ModelChange:
-    """What a unit of each of m parameters changes for good in the model: a joint's origin."""
+    """Change of a joint's origin in the robot model by one unit of each of m parameters."""
 
     joint: int  # Index of the joint, from 0
     shifts: FloatArray  # Of its origin, in the frame of the link before, m per unit, (m, 3)
@@ -118,12 +118,12 @@ class Candidate:
 
     @property
     def happened(self) -> bool:
-        """Whether it came at one moment and stayed: before it and after it the arm is another."""
+        """Whether the error began at one moment and stayed, as a step."""
         return not np.isnan(self.moment)
 
     @property
     def of_measurement(self) -> bool:
-        """Whether it lies in how the arm was measured and not in the arm."""
+        """Whether the error is one of the measurement (sensor, marker) and not of the arm."""
         if self.changes is not None:
             return self.changes.of_measurement
         if self.happened:
@@ -149,12 +149,12 @@ class Candidate:
 
     @cached_property
     def key(self) -> tuple[str, tuple[int, ...], str, str, str, str]:
-        """What distinguishes this candidate from all others."""
+        """Key that identifies the candidate among all others."""
         return self.name, self.joints, self.place, self.driver, self.form, self.label
 
     @cached_property
     def label(self) -> str:
-        """Subject, variant and moment in one."""
+        """Text of subject, variant and moment, of those that the candidate has."""
         moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'
         moment = f'until {moment}' if self.ends else moment
         return ' '.join(part for part in (self.subject, self.variant, moment) if part)
@@ -235,13 +235,13 @@ class Effect:
         return Candidate(columns=columns, parameters=tuple(parameters), **{**own, **more})
 
     def sentence_of(self, candidates: Iterable[Candidate]) -> str:
-        """Return its sentence about some candidates."""
+        """Return the sentence about candidates of the effect; another one if all joints slide."""
         return (
             all(candidate.slide for candidate in candidates) and self.slide_sentence
         ) or self.sentence
 
     def remedy_of(self, candidate: Candidate) -> str:
-        """Return what to do about a candidate and others like it."""
+        """Return the remedy for a candidate of this effect."""
         remedy = (candidate.slide and self.slide_remedy) or self.remedy
         return remedy.format(driver=candidate.driver.replace('_', ' '))
 

@@ -67,7 +67,7 @@ class Rocking:
         return _axis(self.degrees)
 
     def __call__(self, context: Context) -> Design:
-        """Return the turn by a radian between the two places, half of it to each side."""
+        """Return the base's turn about the axis per radian between its two rests, ± 0.5."""
         side = np.where(context.base_moment @ self.axis > self.level, 0.5, -0.5)
         return turned(context, [side[:, None] * self.axis], np.zeros(3))
 

@@ -237,7 +237,7 @@ class Context:
         return np.linalg.norm(self.in_sensor, axis=1)
 
     def at(self, rows: IntArray) -> Context:
-        """Return the context of some rows, by their indices in this one and in that order.
+        """Return the context of some rows; ``rows``: their indices here, in the order wanted.
 
         Every value is that which the row has here, also where it depends on other rows: time
         since the first row, the move before, a sensor's centre.
@@ -257,7 +257,7 @@ class Context:
         )
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:
-        """Give the context in runs of so many rows, each with its place; a small one as it is.
+        """Yield slices of at most `rows` rows with their contexts; all rows at once if few.
 
         What a block computes goes with it, so memory does not grow with the rows.
         """
@@ -287,7 +287,7 @@ class Context:
         return ~self.measurements.is_validation
 
     def turns_over(self, joint: int) -> bool:
-        """Return whether a joint (1-based) can turn on past a whole turn: it is then the same."""
+        """Return whether a revolute joint (1-based) turns past a whole turn: errors recur."""
         range_ = self.chain.upper[joint - 1] - self.chain.lower[joint - 1]
         return bool(range_ > MORE_THAN_A_TURN) and not self.slides(joint)
 
@@ -304,7 +304,7 @@ class Context:
 
     @property
     def turning(self) -> tuple[int, ...]:
-        """Those of `moving` that turn."""
+        """Revolute joints (1-based) among `moving`."""
         return tuple(joint for joint in self.moving if not self.slides(joint))
 
     def links(self) -> Sequence[int]:
@@ -325,7 +325,7 @@ class Context:
 
 @dataclass(frozen=True, eq=False)
 class PartOfContext(Context):
-    """Some rows of a context; what depends on more than a row itself is that of the whole."""
+    """Some rows of a context; values that depend on several rows are those of all of it."""
 
     # The context, and which of its rows these are, (n,)
     whole: Context

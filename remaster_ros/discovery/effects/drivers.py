@@ -14,7 +14,7 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """What may drive an error."""
+    """Quantity on which an error may depend."""
 
     # As the candidates have them
     name: str
@@ -30,7 +30,7 @@ class Driver:
     def curve(
         self, context: Context, share: float, finest: float = 0.0, rows: BoolArray | None = None
     ) -> Curve:
-        """Return a free form of it over the rows to fit, or those of them in ``rows`` (n,).
+        """Return a free curve of the driver over the rows to fit, or those among them in ``rows``.
 
         ``share`` and ``finest`` are those of `Curve.of`.
         """
@@ -134,7 +134,7 @@ _OF_JOINTS: dict[str, Callable[[Context, int, str], Driver]] = {
 
 
 def driver_named(context: Context, name: str, joint: int) -> Driver | None:
-    """Return the driver of a candidate by its name; None where it is no single number.
+    """Return the driver of that name; None if the name is not that of a single quantity.
 
     ``joint`` (1-based) is that of a name which has none.
     """

@@ -44,7 +44,7 @@ def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatA
 
 
 def spread(found: FloatArray, count: int) -> FloatArray:
-    """Return at most so many of some gaps (m, 2), spread evenly over them."""
+    """Return at most `count` of some gaps, (m, 2), evenly spread over them."""
     if len(found) == 0:
         return found
     chosen = np.linspace(0, len(found) - 1, min(count, len(found)))
@@ -62,7 +62,7 @@ def after(context: Context, gap: FloatArray) -> FloatArray:
 
 
 def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
-    """Return the columns of a candidate from a moment on, or up to it, and nothing else."""
+    """Return the columns of a candidate from a moment in a gap on, or up to it; else 0."""
     design = candidate.columns(context)
     share = 1.0 - after(context, gap) if ends else after(context, gap)
     values = design.values * (share if design.values.ndim == 2 else share[:, None])
@@ -70,7 +70,7 @@ def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool
 
 
 def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Iterator[Candidate]:
-    """Give a candidate that begins, or becomes more or less, in a gap (2,), and one that ends."""
+    """Yield the candidate changed in a gap, (2,): it begins or changes there, or it ends there."""
     begins = replace(
         candidate,
         parameters=tuple(f'{name}_change' for name in candidate.parameters),
@@ -89,7 +89,7 @@ def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Itera
 def changed(
     context: Context, candidates: Iterable[tuple[Candidate, Changes | None]]
 ) -> Iterator[Candidate]:
-    """Give the changes of candidates, each with how it changes, at moments over the session."""
+    """Yield candidates changed at moments spread over the session; none without times."""
     moments = spread(gaps(context), MOMENTS_OF_CHANGE) if context.has_time else np.zeros((0, 2))
     for candidate, changes in candidates:
         if changes is not None and candidate.penalty is None:

@@ -76,7 +76,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _centers(places: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return at most so many places that stand for all; fewer where readings were repeated."""
+    """Return at most `count` cluster centres of places; fewer if readings were repeated."""
     with warnings.catch_warnings():
         # Two centers that begin at readings of one place: one of them remains without any.
         warnings.filterwarnings('ignore', 'One of the clusters is empty')

@@ -53,7 +53,7 @@ def length(values: FloatArray) -> str:
 
 
 def of_joint(context: Context, joint: int, values: FloatArray) -> str:
-    """Return what adds to the position of a joint (1-based), rad or m: as angle or length."""
+    """Return a joint's motion as text, angle or length; ``values``: draws, rad or m."""
     return length(values) if context.slides(joint) else angle(values)
 
 
@@ -64,7 +64,7 @@ def span_of(context: Context, joint: int, span: float) -> str:
 
 
 def along_mean(draws: FloatArray) -> FloatArray:
-    """Return what draws (draws, c) have along the direction of their mean, (draws,).
+    """Return the components of draws, (draws, c), along the direction of their mean, (draws,).
 
     Absolute values would be too large on the average, and too close to each other, where the
     draws lie about zero.
@@ -80,7 +80,7 @@ def largest(values: FloatArray) -> float:
 
 
 def at_most(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Return the most that a candidate adds to a joint, less its mean; else its displacement.
+    """Return the largest error by a candidate as text: of a joint, less its mean, or of a marker.
 
     In the row where the mean of the draws has it: the largest of each draw would be larger.
     """

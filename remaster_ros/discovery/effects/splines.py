@@ -34,7 +34,7 @@ CLOSED_GAP = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A free form of one driver, with zero mean over the values that it was made for."""
+    """Free curve of a driver (a spline) with zero mean over the values it was made for."""
 
     knots: FloatArray  # Uniform, in the unit of the driver, (m + 4,), or (m + 7,) where closed
     # Where the turn begins that angles are brought to, rad; NaN where the driver is no angle of a
@@ -77,7 +77,7 @@ class Curve:
         return cls(knots, start, closed, found.visited, weights)
 
     def among(self, values: FloatArray) -> Curve:
-        """Return the same curve as visited at other values (n,)."""
+        """Return the same curve with other visited values, (n,)."""
         return replace(self, visited=np.unique(self.in_turn(values)))
 
     @property
@@ -100,14 +100,14 @@ class Curve:
         return folded
 
     def columns(self, values: FloatArray) -> FloatArray:
-        """Return what a unit of each free height adds, (n, m − 1), at values (n,)."""
+        """Return the curve at values (n,) by a unit of each free height, (n, m − 1)."""
         found = self.splines(values)
         ratio = self._others(self.weights) / self.weights[self._pivot]
         return self._others(found) - found[:, [self._pivot]] * ratio
 
     @property
     def places(self) -> FloatArray:
-        """Where each free spline has its peak, (m − 1,)."""
+        """Values of the driver at the peaks of the free splines, (m − 1,)."""
         peaks = centers(self.knots)
         return self._others(peaks[:-DEGREE] if self.closed else peaks)
 
@@ -184,7 +184,7 @@ def basis(values: FloatArray, knots: FloatArray) -> FloatArray:
 
 
 def centers(knots: FloatArray) -> FloatArray:
-    """Return where each spline has its peak, (m,)."""
+    """Return the place of each spline's peak, (m,)."""
     return 0.5 * (knots[:-4] + knots[4:])
 
 

@@ -52,7 +52,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """A form of a driver: its m features, (n, m), with suffixes and unit of the parameters."""
+    """Function of a driver: its m features, (n, m), with suffixes and unit of the parameters."""
 
     driver: str
     name: str
@@ -67,7 +67,7 @@ class _Form:
 def _forms(
     context: Context, driver: Driver, *names: str, rows: BoolArray | None = None
 ) -> Iterator[_Form]:
-    """Give forms of a driver that enter in all or some ``rows``; none where it hardly varies."""
+    """Yield forms of a driver over all rows to fit or some; none if the driver hardly varies."""
     values = driver.value(context)[context.to_fit if rows is None else context.to_fit & rows]
     if not len(values):
         return
@@ -129,7 +129,7 @@ def _candidate(
 
 
 def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...], _Form]]:
-    """Give what may drive a joint's angle, with the joints that it concerns."""
+    """Yield forms of the drivers of a joint's angle, with the joints concerned."""
 
     def by(driver: Driver, *names: str) -> Iterator[tuple[tuple[int, ...], _Form]]:
         joints = (joint,) if driver.joint in (0, joint) else (joint, driver.joint)
@@ -290,7 +290,7 @@ def _frames(context: Context) -> Iterator[Candidate]:
 
 
 def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
-    """Give what may drive a sensor's shift; over time, a line and a wander have names."""
+    """Yield forms of the drivers of a sensor's shift, without time, which has named causes."""
     for driver in slow_drivers(context):
         if driver == TIME:
             continue
