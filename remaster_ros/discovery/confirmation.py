@@ -74,7 +74,7 @@ class Compared:
     """Quantity compared in two sessions, in its unit: value and standard deviation of each.
 
     ``sigmas`` is the difference, other less this, over the standard deviation of both together;
-    NaN where that is zero.
+    NaN if that is zero.
     """
 
     name: str
@@ -99,7 +99,7 @@ class ConfirmedCause:
     rows_common: int  # Rows of the other session in which what drives the cause was seen here
     # Of what the other session could gain from this cause, beside the others fitted there, the
     # share that it gains with the cause as found here: at most 1, negative where that makes it
-    # worse; NaN where there is nothing to gain
+    # worse; NaN if there is nothing to gain
     carried_over: float
     # RMS of the 3-D error in these rows without it, and with it as found here
     rms_without_m: float
@@ -134,7 +134,7 @@ class Confirmation:
     # More than half carries over, and the zero-offsets agree; not where nothing can be told
     confirmed: bool
     same_offsets: bool  # Whether no zero-offset that both sessions determine is another one
-    why: str = ''  # Why nothing can be compared; '' where it can
+    why: str = ''  # Why nothing can be compared; '' if it can
     # 1-based joints whose zero-offset is another one there, by the evidence
     other_joints: tuple[int, ...] = ()
     # The same of those that the sessions do not determine: what the causes leave out moves them
@@ -223,7 +223,7 @@ def share_of_gain(before: float, frozen: float, own: float) -> float:
     """Return the gain by frozen causes in mean square, as a share of the possible gain.
 
     Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
-    most 1: what frozen causes gain could be gained. NaN where that is next to nothing.
+    most 1: what frozen causes gain could be gained. NaN if that is next to nothing.
     """
     could = before**2 - min(own, frozen) ** 2
     if could < LEAST_GAIN * before**2:
@@ -513,7 +513,7 @@ class _Both:
     def offsets(self, best: Choices, joint: int) -> tuple[FloatArray, FloatArray] | None:
         """Return the two zero-offsets of a joint, rad or m, (2,), and their covariance, (2, 2).
 
-        The causes as they are best; None where one of the sessions does not determine it.
+        The causes as they are best; None if one of the sessions does not determine it.
         """
         fit = self.fitted(_with(best, joint, 'own'))
         where = np.array([joint, fit.there[joint]])

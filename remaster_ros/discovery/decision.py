@@ -44,7 +44,7 @@ class Decision:
     # ``cause`` or ``look_alike``; ``open`` where odds of twenty to one are not reached;
     # ``neither`` where the search names none of the two
     answer: Literal['cause', 'look_alike', 'open', 'neither']
-    # Of the cause less that of its look-alike; NaN where they cannot be compared
+    # Of the cause less that of its look-alike; NaN if they cannot be compared
     log_evidence: float
     sigma: float  # How sure the answer is, in standard deviations
 

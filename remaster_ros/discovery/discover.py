@@ -110,7 +110,7 @@ class Discovery:
     search
         How far the chains of the walk agree, and the causes that are rather not there.
     geometry
-        All lengths and tilts beside the zero-offsets, the same taken out; None where they cannot
+        All lengths and tilts beside the zero-offsets, the same taken out; None if they cannot
         be fitted.
     """
 
@@ -161,7 +161,7 @@ def discover_session(
     progress: Progress | None = None,
     clock: Callable[[], float] | None = None,
 ) -> Discovery:
-    """Find what the offsets model leaves out, and extend it.
+    """Find causes of the errors that the offsets model leaves, and extend the model by them.
 
     Parameters
     ----------
@@ -412,7 +412,7 @@ def _as_it_is(left: FloatArray, kept: BoolArray) -> FloatArray:
 
 
 def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
-    """Return what a model leaves, m, (n, 3), as it is and with each step sooner and later.
+    """Return residuals of a model, m, (n, 3), as it is and with each step earlier and later.
 
     Rows just before or after a step look gross where it is dated without them.
     """

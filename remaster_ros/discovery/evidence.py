@@ -75,7 +75,7 @@ def solve(
 
 @dataclass(eq=False)
 class System:
-    """The mixed-model equations of one set of candidates, in scaled columns.
+    """Mixed-model equations of one set of candidates, in scaled columns.
 
     The Gram matrices are `packed`, (groups, length of size + 1).
     """
@@ -90,7 +90,7 @@ class System:
 
     @classmethod
     def of(cls, data: Residuals, candidates: Sequence[Candidate]) -> System | None:
-        """Assemble the equations of some candidates; None if one of them displaces no marker."""
+        """Assemble the equations of some candidates; None if a free one displaces no marker."""
         # Penalised ones last: one Cholesky factor holds all determinants.
         candidates = tuple(sorted(candidates, key=lambda candidate: candidate.penalty is not None))
         norms, grams = data.gram_matrices(candidates)

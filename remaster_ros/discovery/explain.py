@@ -82,7 +82,7 @@ class FoundEffect:
     confusable_with: tuple[LookAlike, ...]
     cause: str
     size_m: float  # RMS of what it does to the marker after absorption, over the fitted rows, m
-    # Of the gain on held-out poses, see `shares`; None where the cause was found by how far the
+    # Of the gain on held-out poses, see `shares`; None if the cause was found by how far the
     # fit moved a marker, not in the residuals
     share: float | None = None
     # A look-alike that measurements could distinguish explains the data as well
@@ -102,7 +102,7 @@ class FoundEffect:
     def sampled(
         self, result: FitResult, group: Sequence[Candidate] = (), data: Residuals | None = None
     ) -> FoundEffect:
-        """Return the effect with its parameters as the extended model's posterior has them.
+        """Return the effect with parameters of the extended model's posterior.
 
         With its candidates and the rows that they were fitted to, its sizes as well.
         """
@@ -154,7 +154,7 @@ class FoundEffect:
 
     @property
     def sigmas(self) -> float:
-        """Size of its clearest parameter in standard deviations."""
+        """Largest |value| / std among the parameters."""
         return clearest((one.value, one.std) for one in self.parameters)
 
     @property
@@ -291,7 +291,7 @@ def _described(walk: Walk, group: tuple[Candidate, ...], share: float) -> FoundE
 
 
 def _also_called(alike: Sequence[LookAlike]) -> str:
-    """Return a sentence with the other names of the same displacement; '' where it has none."""
+    """Return a sentence on look-alikes with exactly the same displacement; '' if none has."""
     names = [sentence_case(other.title) for other in alike if other.same]
     if not names:
         return ''
@@ -439,7 +439,7 @@ def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:
 
 
 def in_words(group: Sequence[Candidate], context: Context) -> str:
-    """Return the sentence for a technician, with what the session leaves open."""
+    """Return the sentence on a cause for a technician, with its open questions."""
     first = group[0]
     joints = _joints(group)
     effect = EFFECTS[first.name]
@@ -529,7 +529,7 @@ class _Parts:
         solution: Solution,
         rows: BoolArray,
     ) -> _Parts:
-        """Assemble; rows are those to judge by, (all rows,)."""
+        """Assemble the equations; ``rows``: those to judge by, (all rows,)."""
         p, candidates = data.base.shape[2], solution.candidates
         joined = (data.base, data.columns(candidates), data.errors[:, :, None])
         white = data.noise_model.whitened(np.concatenate(joined, axis=2), solution.noise)

@@ -96,7 +96,7 @@ def rms(errors: FloatArray, rows: BoolArray) -> float:
 
 
 def pose_common_fraction(data: Residuals, solution: Solution) -> float:
-    """Return the share of the noise's variance that rows of one pose have in common."""
+    """Return the share of the noise's variance that is common to the rows of a pose."""
     noise = data.noise_model.sensor_noise(solution.noise)
     common = np.sum(noise.pose_sigma**2)
     return float(common / np.sum(noise.total**2))
@@ -138,7 +138,7 @@ def _p_value_ranks(some: FloatArray, others: FloatArray) -> float:
 
 
 def _ranks(values: FloatArray) -> FloatArray:
-    """Return the rank of each value; equal ones have their mean."""
+    """Return the rank of each value, from 1; equal values share their mean rank."""
     _, which, counts = np.unique(values, return_inverse=True, return_counts=True)
     ranks: FloatArray = (np.cumsum(counts) - 0.5 * (counts - 1))[which]
     return ranks

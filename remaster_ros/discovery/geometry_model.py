@@ -49,7 +49,7 @@ FEWEST_POSES = 5
 
 @dataclass(frozen=True, eq=False)
 class GeometryModel:
-    """The arm with the lengths and tilts that its session shows; k joints, m lengths and tilts."""
+    """Robot model with lengths and tilts as fitted to a session; k joints, m lengths and tilts."""
 
     # Of the drawing: RMS displacement of the marker by each length and each tilt, m
     tolerance_m: float
@@ -141,7 +141,7 @@ class GeometryModel:
 
 @one_thread
 def geometry_model(found: Estimate, causes: Sequence[Candidate] = ()) -> GeometryModel | None:
-    """Fit all lengths and tilts beside the zero-offsets; None where they cannot be fitted.
+    """Fit all lengths and tilts beside the zero-offsets; None if they cannot be fitted.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _without_open_offsets(found: Estimate) -> Estimate:
 
 
 def _lengths(context: Context) -> list[Candidate]:
-    """Candidates of link lengths along x, y, z of each frame, or a link if it is among these."""
+    """Candidates along x, y, z of each link's frame, or along the link for an axis it is near."""
     # A link's own direction is one more where it is none of the axes of its frame.
     candidates = list(link_length.candidates(context))
     per_link = {

@@ -35,7 +35,7 @@ class Unexplained:
     where: str
     driver: str
     size_m: float  # RMS of the 3-D error, m
-    p_value: float  # Of seeing as much by chance; NaN where too few poses are held out
+    p_value: float  # Of seeing as much by chance; NaN if too few poses are held out
     next: str  # What it means and what to do next, one or two sentences
 
 

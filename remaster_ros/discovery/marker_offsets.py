@@ -40,7 +40,7 @@ HIDDEN = 0.1
 def moved_markers(
     found: Estimate, data: Residuals, noise: Noise, causes: Sequence[Candidate]
 ) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker that the fit moved beyond its stated accuracy.
+    """Return an effect for every marker whose fitted place is beyond its stated accuracy; ().
 
     The causes are fitted beside them.
     """

@@ -187,7 +187,7 @@ class _Checks:
             yield int(measurements.observation[row]), f'held out, off by {1e3 * length:.1f} mm'
 
     def far_off(self) -> Iterator[Unexplained]:
-        """Each sensor of whose held-out rows more than a tenth are gross, but for mispaired ones.
+        """Entry for each sensor with more than a tenth of its held-out rows gross, not mispaired.
 
         Steps among the fitted rows are found by the search. Where held-out poses were measured
         last, as in many protocols, what was bumped between the two shows in held-out rows alone.
@@ -277,7 +277,7 @@ class _Checks:
         )
 
     def beyond_stated(self) -> Iterator[Unexplained]:
-        """Errors larger than what the sensor itself states allows, or any instrument."""
+        """Entry for each error beyond the sensor's own statement, or beyond any instrument."""
         for check in self.fit.noise_checks:
             if check.is_of_no_instrument:
                 yield Unexplained('noise', 'unknown', check.error_m, np.nan, check.no_instrument)
@@ -301,7 +301,7 @@ class _Checks:
 
 
 def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
-    """Give an entry for each sensor whose error is more than its noise, if nothing else is found.
+    """Yield an entry for each sensor whose error exceeds its noise, in a session of few poses.
 
     What all readings of a pose share counts as noise in the model, and takes up what moved between
     few poses: the scatter within poses does not. With more poses the search tells the two apart.
@@ -329,7 +329,7 @@ def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
 def errors_by_place(
     data: Residuals, solution: Solution, significance: float
 ) -> Iterator[Unexplained]:
-    """Give an entry for each sensor whose errors follow the place, with no field of its own.
+    """Yield an entry for each sensor whose errors depend on the place, beside found causes.
 
     In the search a field over a sensor's volume has to beat the best of all that is tried. Here
     the place alone is asked for, one F test a sensor: do polynomials of it up to the second degree

@@ -36,7 +36,7 @@ def of_rows(rows: FloatArray, first: int) -> FloatArray:
 
 
 def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
-    """Add to a packed matrix the products of columns (r, size), from its row ``first`` on."""
+    """Add products of columns, (r, size), to a packed matrix, from its row ``first`` on."""
     size = columns.shape[1]
     for start in range(first, size, TILE):
         end = min(start + TILE, size)

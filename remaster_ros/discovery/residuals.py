@@ -39,7 +39,7 @@ KEPT_GRAMS = 4
 
 
 class Fit(Protocol):
-    """Candidates with their parameters (m,), and the step of the base columns (p,) beside them."""
+    """Parameters of candidates, (m,), with the step of the base columns fitted with them, (p,)."""
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
@@ -56,7 +56,7 @@ class Fit(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """n rows, sorted by sensor and pose, with what the offsets model leaves of them."""
+    """Residuals of the offsets model in n rows, sorted by sensor and pose."""
 
     context: Context  # All rows of the session at the solution of the offsets model
     rows: Rows  # The rows worked on; ``source`` are their indices in the context

@@ -262,7 +262,7 @@ class Surface:
 
 
 class State:
-    """A model on a surface, with what every candidate would add to it.
+    """Model on a surface, with the gain by each candidate that could be added.
 
     Products of the columns are those of their residuals beside the model: with the errors
     (``pull``, (m,)), and with themselves (``square``, (m,)). ``value``: log posterior relative to
@@ -480,7 +480,7 @@ class Walker:
             self.state = state
 
     def _draw(self, state: State, heat: float) -> tuple[int, int] | None:
-        """Draw a block and its level by the posterior of what it adds."""
+        """Draw a block and its level by gain; None if no block can be added."""
         gain = state.gains.ravel()
         top = gain.max()
         if not np.isfinite(top):
@@ -490,7 +490,7 @@ class Walker:
         return divmod(min(index, gain.size - 1), len(LEVELS_M))
 
     def _which(self, state: State, heat: float) -> int:
-        """Draw a block of the model: half by how little is lost without it, half evenly."""
+        """Draw a block of the model: half by how small its loss is, half evenly."""
         chance = np.exp(-heat * (state.losses - state.losses.min()))
         chance = 0.5 * chance / chance.sum() + 0.5 / len(chance)
         return int(self.rng.choice(len(chance), p=chance))

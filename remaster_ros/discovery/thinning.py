@@ -48,7 +48,7 @@ def draw_rows(
     rng: np.random.Generator,
     most: int = MOST_ROWS,
 ) -> IntArray:
-    """Return about `most` of the given rows, drawn evenly over time; all where they are fewer.
+    """Return about `most` of the given rows, drawn evenly over time; all if they are fewer.
 
     Whole poses are drawn, one of every few consecutive ones that the same sensors measured. Where
     that would leave few poses, `FEWEST_POSES` are, with fewer rows of each.

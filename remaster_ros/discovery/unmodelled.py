@@ -64,7 +64,7 @@ class Unmodelled:
         return int(self.found.model.size + len(self.solution.parameters))
 
     def by_models(self, models: Sequence[tuple[Solution, float]]) -> FloatArray:
-        """Return the movement to each other model, by the root of its share.
+        """Return the change of all parameters to each other model, times the root of its share.
 
         The squares of the columns are the variance among the models.
         """

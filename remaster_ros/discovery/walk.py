@@ -142,7 +142,7 @@ def p_value(log_evidence_gain: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """A model at the maximum of its likelihood over noise and background."""
+    """Model with noise and background at the maximum of its likelihood."""
 
     data: Residuals
     model: Model
@@ -395,7 +395,7 @@ class Walk:
         self._weigh()
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
-        """Add changes to the pool; return the best models, each with its most likely change.
+        """Add likely changes to the pool; return best models with the most likely change.
 
         Beside the model and in the place of each of its blocks, also without a wander: that
         follows whatever changes. Changes are many and hardly ever there: their columns are worked
@@ -604,7 +604,10 @@ class Walk:
         return self._wholes[model]
 
     def _settled(self, model: Model, before: Evaluated, anew: bool) -> Evaluated:
-        """Return a model at its own noise, with members that stand out as blocks."""
+        """Return a model at its own noise, with members that stand out added as blocks.
+
+        ``before`` if the model cannot be fitted; ``anew``: choose the background anew.
+        """
         if anew:
             best = self._whole(model, before)
         else:
@@ -722,7 +725,7 @@ class Walk:
 
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
-        """All models by the parameters of their candidates, each with its share."""
+        """All models as solutions in their candidates' parameters, each with its share."""
         shares = self.share.tolist()
         return [
             (self.solution(one), share) for one, share in zip(self.models, shares, strict=True)
@@ -784,7 +787,7 @@ class Walk:
         return found
 
     def _is_part(self, candidate: Candidate, form: Candidate) -> bool:
-        """Return whether one of thousands of shapes is a part of a free form that is there."""
+        """Return whether a candidate of thousands (`many`) is a part of a free form."""
         if not (EFFECTS[candidate.name].many and candidate.is_shape_of(form)):
             return False
         both = [

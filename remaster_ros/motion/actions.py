@@ -27,10 +27,10 @@ class CheckPath:
 class PathAnswer:
     """The answer to a `CheckPath`."""
 
-    path: FreePath | None  # A free path; None where there is none
+    path: FreePath | None  # A free path; None if there is none
     why: str = ''  # What is in the way
     at_start: bool = False  # The arm stands in contact or within a margin already
-    way_out: FreePath | None = None  # The slow way out of that; None where none is known
+    way_out: FreePath | None = None  # The slow way out of that; None if none is known
 
 
 @dataclass(frozen=True)

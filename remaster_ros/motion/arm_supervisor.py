@@ -87,7 +87,7 @@ class ArmSupervisor:
     halted
         Why the arm was halted already before this process started; ''.
     end
-        Where the last command led before this process started, rad or m, (k,); None where that
+        Where the last command led before this process started, rad or m, (k,); None if that
         is not known.
 
     Attributes
@@ -167,7 +167,7 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:
-        """Process the recorder's answer that it is done with a settled configuration."""
+        """Process the recorder's answer that a settled configuration is done; return actions."""
         actions: list[Action] = []
         visit = self._motion.visit
         measures = self.state is Arm.MEASURES
@@ -376,12 +376,12 @@ class ArmSupervisor:
 
     @property
     def end(self) -> FloatArray | None:
-        """Where the last command led, (k,); None before it is sure that the arm is there."""
+        """End of the last command, rad or m, (k,); None until the arm is known to be there."""
         return None if self._unsure else self._motion.led.end
 
     @property
     def next_end(self) -> FloatArray | None:
-        """Where the next piece of the move under way ends, (k,); None where there is none."""
+        """End of the next piece of the move under way, rad or m, (k,); None without a move."""
         return self._motion.next_end
 
     def use_stamps(self, *, kept: bool) -> None:
@@ -524,7 +524,7 @@ class ArmSupervisor:
         return [*actions, *self.tick(wall_s)]
 
     def _refuse(self, solution: int, reason: str) -> list[Action]:
-        """Give up a configuration that is not commanded; halt after too many of them."""
+        """Actions after a configuration was refused: a halt after `REFUSED_IN_A_ROW`."""
         self._queue.next = solution + 1
         self._refusals += 1
         failed = self._step(Event.REFUSED, Failed(solution, reason))
@@ -535,7 +535,7 @@ class ArmSupervisor:
     # Inside: what becomes of the motion under way
 
     def _conclude(self, outcome: str, why: str, seen: Seen) -> list[Action]:
-        """Decide what follows from the outcome of a configuration or of a stop."""
+        """Actions after the outcome of a visit or a stop; ``why``: the outcome's reason."""
         visit = self._motion.visit
         if outcome == 'halted':
             return self._halt(why, Event.ASTRAY)
@@ -550,7 +550,7 @@ class ArmSupervisor:
         return self._fail(visit.solution, why) if outcome == 'failed' and visit is not None else []
 
     def _fail(self, solution: int, reason: str) -> list[Action]:
-        """Give a configuration up; halt where too many in a row were not reached.
+        """Actions after a configuration was not reached; halt after too many in a row.
 
         The arm has settled there or its trajectory has ended, so that no stop is needed.
         """

@@ -103,7 +103,7 @@ class Seen:
 
 
 class Following:
-    """Compare the arm with one trajectory, report by report.
+    """Comparison of the arm's reports with the trajectory that it was sent.
 
     ``trajectory``: where it was sent; ``sent, sent_wall``: when, robot time and wall time, s;
     ``rules``: how far it may lag and how long a command may take to be seen.
@@ -206,7 +206,7 @@ class Following:
         return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
 
     def _look(self, seen: Seen, elapsed: float) -> str:
-        """Return how the arm is off its path, '' where it follows; note how far it lags."""
+        """Return how the arm is off its path, or '' if it follows; keep its lag."""
         if not self.reacted:
             still = self._is_still_at_start(seen)
             if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
@@ -268,7 +268,7 @@ class Following:
         return longest > ON_PATH_RAD and away <= self._rules.settle.arrive_tolerance
 
     def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
-        """Return how far `q` is behind the trajectory, s, its way off it, (k,), and if it is near.
+        """Return the lag of `q`, s, its offset from the path, (k,), and whether the arm is near.
 
         Near is what is within `ON_PATH_RAD` of where it should be: at the ends of a line a small
         distance is a long time.
@@ -307,5 +307,8 @@ def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:
 
 
 def allowed_lag_s(rules: SupervisorRules, rate: float) -> float:
-    """Return how far an arm may be behind its trajectory, s of robot time."""
+    """Return the largest allowed lag of an arm behind its trajectory, s of robot time.
+
+    ``rate``: robot time per wall time.
+    """
     return rules.lag_s + LATENCY_S * max(rate, 1.0)

@@ -54,7 +54,7 @@ class Interlocks:
         Consent is given by another run than the last one, not by a pause: a summary from before
         may come late.
 
-        ``state``: anything but ``running`` is in the way; ``run``: names the run, '' where none is
+        ``state``: anything but ``running`` is in the way; ``run``: names the run, '' if none is
         under way; another one than before was begun by a person since; ``wall_s``: now, s.
         """
         self.paused = state == 'paused'
@@ -74,7 +74,7 @@ class Interlocks:
         self._reasons[name] = reason
 
     def reason(self, name: str) -> str:
-        """Return why the arm must not move, by one origin; ''."""
+        """Return an origin's reason not to move, or ''."""
         return self._reasons.get(name, '')
 
     def was_right(self, name: str) -> bool:
@@ -166,12 +166,12 @@ class Interlocks:
             self.say(Word.FREE)
 
     def blocked(self, wall_s: float) -> str:
-        """Return why the arm must not move; '' if it may."""
+        """Return the first reason not to move, or ''."""
         return self._hindrance(wall_s) or self.asks_for_collect
 
     @property
     def asks_for_collect(self) -> str:
-        """Why nothing moves before a person begins a collection, and what to call; ''."""
+        """Why a person must call /remaster/collect before anything moves, or ''."""
         asked = self.consent is Consent.ASKED
         return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 

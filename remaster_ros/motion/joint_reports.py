@@ -94,7 +94,7 @@ class ClockRate:
 
 
 class JointReports:
-    """Judge reports one by one.
+    """Plausibility checks of joint reports, one after the other.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ class JointReports:
         return '', ''
 
     def _learn(self, report: JointReport) -> None:
-        """Follow the usual delay of reports: fast where it shrinks, else as clocks drift."""
+        """Update the usual delay of reports: at once to a smaller one, slowly to a larger one."""
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
             self._delays.append((report.wall_s, delay))

@@ -22,9 +22,9 @@ class LedLast:
 
     ``names, units``: of the joints; ``tolerance_rad``: an arm that is no further off is there;
     ``end``: where it was led before this process was started, rad or m, (k,), or between which
-    places, (n, k); None where that is not known; ``confirms``: the service by which a person
+    places, (n, k); None if that is not known; ``confirms``: the service by which a person
     confirms the report.
-    Attributes: ``end``: where the last command led, (k,); None where that is not known.
+    Attributes: ``end``: where the last command led, (k,); None if that is not known.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class LedLast:
 
     @property
     def end(self) -> FloatArray | None:
-        """Where the last command led, rad or m, (k,); of several places the last one."""
+        """Last commanded position, rad or m, (k,), or None; of several positions the last one."""
         return self._places[-1] if self._places else None
 
     def lead_to(self, *places: FloatArray) -> None:

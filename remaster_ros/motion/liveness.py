@@ -72,7 +72,7 @@ class Liveness:
         now_s
             Now, s.
         started
-            Another text after each start of the node; '' where the node gives none.
+            Another text after each start of the node; '' if the node gives none.
         hidden
             The marker is out of its sight: no reading will come before the arm has moved on.
         """

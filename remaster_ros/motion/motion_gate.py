@@ -84,7 +84,7 @@ class Admitted:
     trajectory: Trajectory | None = None
     # Whether the controller is given no velocities, and draws straight lines
     is_straight: bool = False
-    # Which part of `trajectory` the waypoints are; None where they are no part of one
+    # Which part of `trajectory` the waypoints are; None if they are no part of one
     piece: Piece | None = None
 
 
@@ -96,7 +96,7 @@ class MotionGate:
     limits
         Positions, speeds, accelerations.
     speeds
-        Speed of the fastest point of arm and tool; None where no such limit is kept.
+        Speed of the fastest point of arm and tool; None if no such limit is kept.
 
     Attributes
     ----------

@@ -47,7 +47,7 @@ UNDER_WAY: Outcome = '', ''
 
 @dataclass
 class Visit:
-    """The configuration under way: when it was sent (stamp) and must have arrived (robot time)."""
+    """Move to a configuration: sent at a stamp, with a deadline to arrive, robot time."""
 
     solution: int  # Its number; negative where nothing is measured at the end
     following: Following
@@ -62,7 +62,7 @@ class Visit:
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:
-        """Return the outcome for an arm that is on its way, by a report."""
+        """Return the outcome of a report for an arm on its way to a configuration."""
         detector, rules = self.detector, self.rules
         trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
         settled = detector.update(seen.stamp, seen.q) == 'settled'
@@ -137,7 +137,7 @@ class Braking:
     units: JointUnits
 
     def judge(self, seen: Seen) -> Outcome:
-        """Return whether the arm has come to rest where its stop ends, by a report."""
+        """Return the outcome of a report for a braking arm: 'halted' if it rests elsewhere."""
         stands, way = seen.stands(seen.wall), seen.q - self.end
         off, text = self.units.largest(way), self.units.in_radians(way, 4)
         elsewhere = f'the arm stands {text} from where its stop led: an emergency stop?'
@@ -171,10 +171,10 @@ gives way under the arm's weight does so by another amount in every configuratio
 
 
 class MotionUnderWay:
-    """What the arm does by the last command.
+    """State, visit and stop of the arm by the last command.
 
     ``gate``: every command comes from it; ``end``: where the last command led that was sent before
-    this process was started, rad or m, (k,); None where that is not known; ``state``: to begin in.
+    this process was started, rad or m, (k,); None if that is not known; ``state``: to begin in.
     Attributes: ``state``: see `states.ARM`; ``led``: where the last command led; ``visit``:
     the configuration under way, ``braking``: the stop under way; None in the states without one.
     """
@@ -320,7 +320,7 @@ class MotionUnderWay:
         self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
-        """Return what becomes of the move or the stop by a report; see `Visit` and `Braking`."""
+        """Return the outcome of a report for the move or the stop; see `Visit` and `Braking`."""
         if self.braking is not None:
             return self.braking.judge(seen)
         if self.visit is None:
@@ -333,12 +333,12 @@ class MotionUnderWay:
         return outcome
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why it is not known where on its path a moving arm is; ''."""
+        """Return why a moving arm's place on its path is unknown, or ''."""
         assert self.visit is not None
         return self.visit.following.lost(seen, wall_s)
 
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
-        """Return why a moving arm is not seen to go on along its path just now; ''."""
+        """Return why reports do not show a moving arm going on along its path, or ''."""
         assert self.visit is not None
         if not self._keeps_stamps:
             # It stands where its next step begins.

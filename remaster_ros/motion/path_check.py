@@ -131,7 +131,7 @@ class FreePath:
 
     points: FloatArray  # From where the arm stands to the target, rad or m, (n, k)
     # For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,);
-    # none where no such limit is kept
+    # none if no such limit is kept
     peaks_m: tuple[float, ...] = ()
     way_out: bool = False  # It leads out of a contact or a margin, and is gone slowly
 

@@ -14,7 +14,7 @@ SEED = 20
 
 
 class PathSearch:
-    """Check the planner's way, and look for another where it is not free.
+    """Check of the planner's path, and search for another if it is not free.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ class SensorFacts:
 
 @dataclass(frozen=True)
 class Facts:
-    """The present state of what the first motion needs."""
+    """Present state of robot, nodes and sensors that the first motion needs."""
 
     joints_age_s: float  # Since the last joint_states that name every joint, s
     joints_message: str  # What is wrong with them; ''
@@ -35,7 +35,7 @@ class Facts:
 
 
 def preflight(facts: Facts) -> tuple[str, ...]:
-    """Return what is in the way of the first motion, a line each; nothing if it may begin."""
+    """Return obstacles to the first motion, one line each; () if it may begin."""
     findings = []
     if facts.joints_message:
         findings.append(facts.joints_message)

@@ -27,7 +27,7 @@ from remaster_ros.motion.actions import (
 
 
 class Arm(StrEnum):
-    """What the arm does by this program."""
+    """State of the arm."""
 
     STANDS = 'stands'  # Nothing is under way
     ASKS = 'asks'  # It is found out whether a way, or where the arm stands, is free
@@ -45,7 +45,7 @@ HAS_STOP = (Arm.BRAKES, Arm.HALTS)
 
 
 class Event(StrEnum):
-    """What happens to the arm."""
+    """Event that may change the state of the arm."""
 
     ASK = 'where it stands or its way is to be checked'
     CHECKED = 'the check is answered'
@@ -73,7 +73,7 @@ class Event(StrEnum):
 
 @dataclass(frozen=True)
 class Then:
-    """What follows from an event."""
+    """Next state and actions after an event."""
 
     state: Arm
     actions: tuple[type[Action], ...] = ()  # What leaves the supervisor, in this order
@@ -168,7 +168,7 @@ ARM: Mapping[Arm, Mapping[Event, Then]] = {
 
 
 class Place(StrEnum):
-    """How far it is known that the arm is where it is reported, and may stand there."""
+    """Knowledge of whether the arm is where it is reported, and may stand there."""
 
     UNKNOWN = 'unknown'  # First it is found out whether it may stand where it is reported
     FREE = 'free'  # Then the probe shows that reports are measured
@@ -179,7 +179,7 @@ class Place(StrEnum):
 
 
 class Finding(StrEnum):
-    """What is found out about where the arm is."""
+    """Event that changes the knowledge of the arm's place."""
 
     FREE = 'nothing touches it there'
     ENDED = 'a probe or a way out has ended'
@@ -227,7 +227,7 @@ class Consent(StrEnum):
 
 
 class Word(StrEnum):
-    """What is said about a run."""
+    """Event that changes a person's consent to move."""
 
     HINDERED = 'something is in the way after the first move'
     FREE = 'nothing is in the way any more'

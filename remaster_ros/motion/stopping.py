@@ -54,7 +54,7 @@ def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) 
 
 
 class _Stretch:
-    """The places on a line where an arm may be, and the stops from all of them."""
+    """Places on a line at which an arm may be, and stops from all of them."""
 
     def __init__(self, line: Line, low_s: float, high_s: float, limits: MotionLimits) -> None:
         kinks = [time for time in line.kinks_s if low_s < time < high_s]

@@ -201,7 +201,7 @@ def plan_trajectory(
         rad, (n + 1, k).
     peaks_m
         For each line the speed of the fastest point where the whole way takes a second, m/s, (n,);
-        none where no such limit is kept.
+        none if no such limit is kept.
     """
     peaks = peaks_m or (0.0,) * (len(points) - 1)
     return Trajectory(

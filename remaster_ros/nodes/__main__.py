@@ -25,7 +25,7 @@ NODES = {
 
 
 def main(argv: list[str]) -> int:
-    """Run the node that the first argument names; list the nodes where there is none."""
+    """Run the node that the first argument names; list the nodes if there is none."""
     if not argv or argv[0] in ('-h', '--help', '--list'):
         print('usage: python -m remaster_ros.nodes NAME --ros-args …\n')
         for name, text in NODES.items():

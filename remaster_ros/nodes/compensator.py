@@ -221,7 +221,7 @@ class CompensatorNode(RemasterNode):
         return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)
 
     def on_fault(self, error: Exception) -> None:
-        """Stop the arm, and pass nothing on before a person has looked at it."""
+        """Halt after a fault of this program: cancel goals, pass nothing on until ~/enable."""
         super().on_fault(error)
         if not hasattr(self, '_steady'):
             # It is being made: nothing has been passed on.
@@ -268,7 +268,7 @@ class CompensatorNode(RemasterNode):
         )
 
     def _trouble(self) -> str:
-        """Return why nothing is passed on; ''."""
+        """Return why no trajectory is passed on, or ''."""
         topic = self.resolve_topic_name(JOINTS)
         if self._halted:
             return self._halted
@@ -309,7 +309,7 @@ class CompensatorNode(RemasterNode):
         return self._led.elsewhere(q)
 
     def _moves(self) -> str:
-        """Return that the arm moves, or is about to; ''."""
+        """Return that the arm moves, is about to, or is not reported; or ''."""
         if not self._present.is_fresh(time.monotonic()):
             return f'{self.resolve_topic_name(JOINTS)} does not come'
         if not self._present.stands:
@@ -356,7 +356,7 @@ class CompensatorNode(RemasterNode):
         return response
 
     def _turn(self, on: bool) -> str:
-        """Begin or end to correct, and return what is said of it."""
+        """Switch the correction on or off; return a sentence on the correction in use."""
         self._on, self._wanted = on, -1
         self._true = self._motion.TrueAngles(self._correction.compensator)
         self._in_use = used = self._correction if on else self._correction.off()
@@ -547,7 +547,7 @@ class CompensatorNode(RemasterNode):
         self._keep(passed.admitted.waypoints[-1].q)
 
     def _note_held(self) -> None:
-        """Process that the controller holds the arm on its way: where on it, is not known."""
+        """Note that the controller holds the arm somewhere along the trajectory passed on."""
         passed, since_s = self._passed, self.now_s() - self._begun_s
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s:
             lag_s = allowed_lag_s(SupervisorRules(), 1.0)

@@ -175,7 +175,7 @@ class TopicLink:
         self._publisher.publish(message)
 
     def cancel(self) -> None:
-        """Do nothing: what was published is not taken back."""
+        """Do nothing: a trajectory that was published on a topic cannot be cancelled."""
 
     def close(self) -> None:
         """Do nothing: a message that was published is sent."""

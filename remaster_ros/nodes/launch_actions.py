@@ -44,7 +44,7 @@ def describe_launch(
 
 
 def _action(node: NodeToStart) -> Node:
-    """Return the launch action of a node: started again where it was killed, a few times."""
+    """Return the launch action of a node, which is started again a few times if killed."""
     return Node(
         package='remaster_ros',
         executable=node.executable,

@@ -98,7 +98,7 @@ class Parameters:
 
 
 class PrecisionWatch:
-    """Fit the session after `every` so many configurations, 0 never; publish what is known."""
+    """Fits the session after every `every` configurations (0: never); publishes its precision."""
 
     def __init__(
         self,

@@ -308,7 +308,7 @@ class Acknowledged:
         self._before: dict[str, int] | None = None
 
     def begin(self, wait_s: float, ending: threading.Event) -> None:
-        """Find out whether a recorder is there, and how many messages it has taken already.
+        """Detect a recorder, and note how many messages it has taken already.
 
         Raises InputError: it is there and does not answer.
         """

@@ -33,7 +33,7 @@ COUNT_WALL_S = 3.0
 
 
 class OnlyPublisher:
-    """See that a topic has one publisher, or with `allowed` 0 none."""
+    """Check that a topic has at most `allowed` publishers: one, or none."""
 
     def __init__(self, node: Node, topic: str, message_type: Any, allowed: int = 1) -> None:
         self._node, self._type, self._allowed = node, message_type, allowed

@@ -380,7 +380,7 @@ class RobotBridge(RemasterNode):
             # Paths are checked where the arm is, not where its encoders put it.
             true_arm, self._shifts = correction.true_arm, correction.shifts
             unknown_rad = correction.joint_angle_bound(np.deg2rad(cell.unknown_offset_deg))
-        # What it has changed of each solution of the pose, rad, (m, k); None where it is off.
+        # What it has changed of each solution of the pose, rad, (m, k); None if it is off.
         self._changes: FloatArray | None = None
         model = cell.collision_model(true_arm, unknown_rad)
         speeds = PointSpeeds(true_arm, model.extent_points)
@@ -487,7 +487,7 @@ class RobotBridge(RemasterNode):
         )
 
     def on_fault(self, error: Exception) -> None:
-        """Stop and halt the arm: what this process knows of it may be half done."""
+        """Halt the arm after a fault of this program, as its state may be inconsistent."""
         why = str(fault_of_this_program(error))
         super().on_fault(error)
         if not hasattr(self, '_closing'):
@@ -759,7 +759,7 @@ class RobotBridge(RemasterNode):
             raise
 
     def _publish(self, admitted: Admitted, kind: str = 'move', begins_s: float = 0.0) -> None:
-        """Publish what the gate has admitted; nothing else is ever published to a controller."""
+        """Publish a trajectory that the gate has admitted; nothing else goes to a controller."""
         # A stop is a trajectory too: an empty one is refused by some versions of
         # joint_trajectory_controller, and the arm goes on.
         message = JointTrajectory(joint_names=list(self.chain.joint_names))

@@ -49,7 +49,7 @@ LEAVES_WITHIN_S = 20
 
 
 class RemasterNode(Node):
-    """A node that `run` can end, and of whose name there is one in a ROS domain.
+    """Node that `run` can end, and that is the only one of its name in a ROS domain.
 
     Raises InputError: another process on this computer is that node.
     """
@@ -115,7 +115,7 @@ class RemasterNode(Node):
         return response
 
     def on_fault(self, error: Exception) -> None:
-        """Process an exception that a callback has not caught: it is reported with its place.
+        """Report an exception that a callback has not caught, with its place in the code.
 
         A node that leads an arm stops and halts the arm here, and lives on.
         """
@@ -128,7 +128,7 @@ class RemasterNode(Node):
             self.failure = fault
 
     def on_unreadable(self, name: str, error: Exception) -> None:
-        """Report a message, request or answer of which nothing can be read: it is left out."""
+        """Report a message, request or answer that cannot be read, and is dropped."""
         text = str(error)[:LONGEST_TEXT] if isinstance(error, RemasterError) else ''
         why = f'{name}: a message is left out: {text or type(error).__name__}'
         if why not in self._faults and len(self._faults) < MOST_FAULTS:
@@ -136,12 +136,12 @@ class RemasterNode(Node):
             self.get_logger().error(why)
 
     def now_s(self) -> float:
-        """Time of the node's clock, s; simulated where use_sim_time is set."""
+        """Time of the node's clock, s; simulated if use_sim_time is set."""
         return self.get_clock().now().nanoseconds * 1e-9
 
     @property
     def clock_trouble(self) -> str:
-        """Why the node's clock has no time: a simulated one that was not received yet; ''."""
+        """Why the node has no time (no simulated clock received yet), or ''."""
         if self.get_clock().now().nanoseconds > 0:
             return ''
         topic = self.resolve_topic_name('/clock')
@@ -257,7 +257,7 @@ class _Takes(Executor):
 
 
 class OneThread(_Takes, SingleThreadedExecutor):
-    """rclpy's executor of one thread; see `_Takes`."""
+    """Executor of one thread of rclpy that survives unreadable messages; see `_Takes`."""
 
 
 class _Threads(_Takes, MultiThreadedExecutor):
@@ -324,7 +324,7 @@ def run(
 
 
 def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:
-    """Execute what is due; what a callback has not caught goes to the node's `on_fault`."""
+    """Execute the callbacks that are due; an uncaught exception goes to the node's `on_fault`."""
     try:
         executor.spin_once(timeout_sec=timeout_s)
     except ExternalShutdownException:

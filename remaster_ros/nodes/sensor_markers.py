@@ -252,7 +252,7 @@ RETRY_S = 0.5
 
 
 class SensorNode(RemasterNode):
-    """A node that publishes the markers which one of the cell's sensors measures.
+    """Node that publishes the marker positions measured by one of the cell's sensors.
 
     ``name``: of the node, where none is given on its command line; it chooses the driver, unless
     it is that of no registered sensor: then the given one does.
@@ -376,7 +376,7 @@ class SensorNode(RemasterNode):
             self.failure = error
 
     def _read(self, driver: StreamDriver) -> float | None:
-        """Publish the next reading of a stream; return when it came, s, None where none did."""
+        """Publish the next reading of a stream; return its time, s, or None if there is none."""
         try:
             reading = driver.read()
         except DeviceError as error:

@@ -42,14 +42,14 @@ UNNAMED = '_NODE_NAME_UNKNOWN_'
 
 
 def node_of(info: TopicEndpointInfo) -> str:
-    """Return the full name of an endpoint's node, or words in its place where it is not known."""
+    """Return the full name of an endpoint's node; 'a node that has just started' if unknown."""
     if info.node_name == UNNAMED:
         return 'a node that has just started'
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
 def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
-    """Return why a subscriber gets nothing of a publisher; '' where it does.
+    """Return why a subscriber gets no messages of a publisher by their QoS; '' if it does.
 
     Leases and deadlines are not looked at: `nodes.rivals` requires a lease that foreign publishers
     do not offer, in order to leave them out.
@@ -64,7 +64,7 @@ def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
 
 
 def mismatches(node: Node) -> str:
-    """Return what a node's topics lose by QoS, as text; '' where nothing.
+    """Return a text on the topics of a node that lose messages by QoS; '' if none does.
 
     By the graph, not by events of the middleware: rclpy looks at each event handler for every
     message, half of what a message costs.
@@ -129,7 +129,7 @@ class Summary(NamedTuple):
 
 
 class NodeStatus:
-    """Publish a node's state and events; end the node where another of its name is longer there.
+    """Publishes a node's state and events; ends the node if a namesake runs for longer.
 
     ``hardware_id``: in /diagnostics: the device that the node is for; ``model``: which arm the
     node computes with; every record carries it.

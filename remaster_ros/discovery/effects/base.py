@@ -42,7 +42,7 @@ NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 class Design:
     """Displacements, or added joint positions, in n rows by one unit of each of m parameters."""
 
-    at: int | None  # Index of the joint whose angle it adds to; None where it displaces the marker
+    at: int | None  # Index of the joint whose angle it adds to; None if it displaces the marker
     # Added joint angle, rad or m per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
     values: FloatArray
 
@@ -80,14 +80,14 @@ class Candidate:
     parameters: tuple[str, ...]
     unit: str
     columns: Callable[[Context], Design]  # What a unit of each does
-    joints: tuple[int, ...] = ()  # 1-based; () where none
+    joints: tuple[int, ...] = ()  # 1-based; () if none
     # How many candidates like it are tried: its prior probability is that of its kind over this
     drawn_from: int = 1
     # For free forms: precision of the parameters, (m, m), up to the smoothness; None else
     penalty: FloatArray | None = None
     # Distinguishes candidates of the same name and joints: the order of a harmonic, an axis
     variant: str = ''
-    # The sensor or marker it is about; '' where it is about joints or the whole arm
+    # The sensor or marker it is about; '' if it is about joints or the whole arm
     subject: str = ''
     # Standard deviation of the prior on each parameter about 0, in ``unit``: the largest that is
     # plausible. None: what displaces the marker by `LARGEST_M`.
@@ -133,7 +133,7 @@ class Candidate:
         )
 
     def is_shape_of(self, form: Candidate) -> bool:
-        """Return whether it is one of the shapes that a free form can have."""
+        """Return whether this candidate is one shape among those of a free form."""
         return (
             form.penalty is not None
             and self.penalty is None
@@ -143,7 +143,7 @@ class Candidate:
 
     @cached_property
     def roughness(self) -> FloatArray:
-        """Eigenvalues of the penalty, ascending, (m,); none where there is none."""
+        """Eigenvalues of the penalty, ascending, (m,); (0,) without a penalty."""
         penalty = np.zeros((0, 0)) if self.penalty is None else self.penalty
         return np.linalg.eigvalsh(penalty).astype(float, copy=False)
 
@@ -161,7 +161,7 @@ class Candidate:
 
 
 class Changes(Protocol):
-    """Columns of a candidate that is there only after a moment in a gap (2,), s, or before it."""
+    """Columns of a candidate that is present only after, or before, a moment in a gap."""
 
     def __call__(
         self, context: Context, candidate: Candidate, gap: FloatArray, ends: bool
@@ -184,7 +184,7 @@ class Effect:
     source: str
     unit: str  # Of its parameters
     # Range of size that real machines have, in ``unit``; its upper end is the standard deviation
-    # of the prior on each parameter. None where nothing is known.
+    # of the prior on each parameter. None if nothing is known.
     plausible: tuple[float, float] | None
     # For a technician; ``{subject}`` (its joints or sensor), ``{other}`` (the joint that drives)
     # and ``{driver}`` are filled in
@@ -195,7 +195,7 @@ class Effect:
     # parameters (draws, m); see `sizes`
     size: Callable[[Context, Candidate, FloatArray], str]
     candidates: Callable[[Context], Iterable[Candidate]]  # All of its candidates for a context
-    # Returns why a context cannot show it; '' where it can
+    # Returns why a context cannot show it; '' if it can
     needs: Callable[[Context], str] = field(default=lambda context: '')
     # Which of its candidates are members of its kind: one for each joint, not every variant
     in_family: Callable[[Candidate], bool] = field(default=lambda candidate: True)
@@ -214,7 +214,7 @@ class Effect:
     reported_as: str = ''
     # False for structure that is located without a cause: it is reported as unexplained
     is_cause: bool = True
-    # In place of sentence and remedy where it is about joints that slide; '' where these are right
+    # In place of sentence and remedy where it is about joints that slide; '' if these are right
     slide_sentence: str = ''
     slide_remedy: str = ''
     # For what happened at one moment: its candidates in all gaps between rows that reach between
@@ -300,22 +300,22 @@ def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> D
 
 
 def needs_gravity(context: Context) -> str:
-    """Return why gravity's effects cannot be tested; '' where they can."""
+    """Return why gravity's effects cannot be tested; '' if they can."""
     return '' if context.has_gravity else 'the URDF has no link masses, so gravity is unknown'
 
 
 def needs_approach(context: Context) -> str:
-    """Return why approach and last move cannot be tested; '' where they can."""
+    """Return why approach and last move cannot be tested; '' if they can."""
     return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
 def needs_motion(context: Context) -> str:
-    """Return why effects of motion cannot be tested; '' where they can."""
+    """Return why effects of motion cannot be tested; '' if they can."""
     return '' if context.has_motion else 'the arm stood still at every reading'
 
 
 def needs_time(context: Context) -> str:
-    """Return why drift cannot be tested; '' where it can."""
+    """Return why drift cannot be tested; '' if it can."""
     if context.has_time:
         return ''
     return 'all rows have the same time' if context.timed else NO_TIMES

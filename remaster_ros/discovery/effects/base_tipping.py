@@ -22,7 +22,7 @@ FINER = np.arange(-4, 5) / 4.0
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """About each axis, where the moment of the arm's weight exceeds each of some values."""
+    """Rocking about each of `AXES` axes, at several quantiles of the weight's moment about it."""
     for degrees in np.arange(AXES) * (180.0 / AXES):
         for share in SHARES:
             yield _candidate(context, float(degrees), share)
@@ -40,7 +40,7 @@ def _candidate(context: Context, degrees: float, share: float) -> Candidate:
 
 
 def finer(context: Context, candidate: Candidate) -> Iterator[Candidate]:
-    """Give candidates about axes and moments near those of another."""
+    """Yield candidates with axes and moments near those of a candidate."""
     best = candidate.columns
     assert isinstance(best, Rocking)
     share = float(np.mean(context.base_moment[context.to_fit] @ best.axis <= best.level))
@@ -56,7 +56,7 @@ def _axis(degrees: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class Rocking:
-    """Columns of a base that rocks about an axis of R, where the moment about it has a value."""
+    """Columns of a base that rocks about an axis of R if its moment exceeds a level."""
 
     degrees: float  # Of the horizontal axis, from x of R
     level: float  # N m
@@ -67,7 +67,7 @@ class Rocking:
         return _axis(self.degrees)
 
     def __call__(self, context: Context) -> Design:
-        """Return the base's turn about the axis per radian between its two rests, ± 0.5."""
+        """Return the columns of a turn by 1 rad between both rests: ± 0.5 rad about the axis."""
         side = np.where(context.base_moment @ self.axis > self.level, 0.5, -0.5)
         return turned(context, [side[:, None] * self.axis], np.zeros(3))
 

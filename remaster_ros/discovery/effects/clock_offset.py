@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor: δp = J q̇ c, c being what its stamps lack."""
+    """One candidate for each sensor: δp = J q̇ c, c: delay missing in its stamps, s."""
     for index, name in enumerate(context.sensor_names):
         yield EFFECT.candidate(
             partial(_moved_on, sensor=index),

@@ -43,9 +43,9 @@ class Context:
     joint_offsets: FloatArray  # As fitted, rad, m of joints that slide, (k,)
     markers: FloatArray  # As fitted, in the tool frame, m, (markers, 3)
     T_R_N: FloatArray  # As fitted, (sensors, 4, 4)
-    # Of the sensors; '' where it is unknown, () where it is of none
+    # Of the sensors; '' if it is unknown, () if it is of none
     sensor_kinds: tuple[Literal['', SensorKind], ...] = field(default=(), kw_only=True)
-    timed: bool = field(default=True, kw_only=True)  # False where the rows' times only order them
+    timed: bool = field(default=True, kw_only=True)  # False if the rows' times only order them
 
     def __len__(self) -> int:
         """Return the number of rows n."""
@@ -98,7 +98,7 @@ class Context:
 
     @cached_property
     def gravity_moment(self) -> FloatArray:
-        """Gravity's moment on each link about its joint, all that hangs on it, N m, (n, k, 3)."""
+        """Gravity's moment about each joint of all links it carries, N m, (n, k, 3)."""
         masses = self.chain.masses
         moments = masses[:, None] * apply(self.frames, self.chain.centers_of_mass)
         carried = np.cumsum(moments[:, ::-1], axis=1)[:, ::-1]
@@ -145,7 +145,7 @@ class Context:
 
     @property
     def has_motion(self) -> bool:
-        """Whether the arm moved while it was measured."""
+        """Whether the arm moved during the measurements."""
         return self.measurements.velocity is not None
 
     @cached_property
@@ -297,7 +297,7 @@ class Context:
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Joints (1-based) that take more than one place in the rows to fit."""
+        """Joints (1-based) that moved by more than `LEAST_TURN_RAD` in the rows to fit."""
         span = np.ptp(self.measurements.q[self.to_fit], axis=0)
         least = LEAST_TURN_RAD * self.chain.per_radian
         return tuple(int(joint) + 1 for joint in np.flatnonzero(span > least))
@@ -333,17 +333,17 @@ class PartOfContext(Context):
 
     @cached_property
     def approach(self) -> FloatArray:
-        """As of the whole, (n, k)."""
+        """`Context.approach` of the whole context in these rows, (n, k)."""
         return self.whole.approach[self.rows]
 
     @cached_property
     def has_approach(self) -> bool:
-        """As of the whole."""
+        """`Context.has_approach` of the whole context."""
         return self.whole.has_approach
 
     @cached_property
     def motion(self) -> MotionColumns:
-        """As of the whole."""
+        """`Context.motion` of the whole context in these rows."""
         return self.whole.motion.at(self.rows)
 
     @cached_property
@@ -353,12 +353,12 @@ class PartOfContext(Context):
 
     @cached_property
     def progress(self) -> FloatArray:
-        """As of the whole, (n,)."""
+        """`Context.progress` of the whole context in these rows, (n,)."""
         return self.whole.progress[self.rows]
 
     @cached_property
     def has_time(self) -> bool:
-        """As of the whole."""
+        """`Context.has_time` of the whole context."""
         return self.whole.has_time
 
     @cached_property
@@ -367,20 +367,20 @@ class PartOfContext(Context):
         return self.whole.warming[self.rows]
 
     def lagging_warming(self, lag_s: float) -> FloatArray:
-        """As of the whole, K, (n,)."""
+        """`Context.lagging_warming` of the whole context in these rows, K, (n,)."""
         return self.whole.lagging_warming(lag_s)[self.rows]
 
     @cached_property
     def has_temperature(self) -> bool:
-        """As of the whole."""
+        """Whether the whole context has temperatures."""
         return self.whole.has_temperature
 
     @cached_property
     def centers(self) -> FloatArray:
-        """As of the whole, (sensors, 3)."""
+        """`Context.centers` of the whole context, m, (sensors, 3)."""
         return self.whole.centers
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """As of the whole."""
+        """`Context.moving` of the whole context."""
         return self.whole.moving

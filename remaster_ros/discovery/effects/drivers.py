@@ -24,7 +24,7 @@ class Driver:
     label: str
     shown_unit: str = ''
     per_shown: float = 1.0
-    joint: int = 0  # The joint (1-based) that it belongs to; 0 where it belongs to none
+    joint: int = 0  # The joint (1-based) that it belongs to; 0 if it belongs to none
     is_angle: bool = False  # It is that joint's angle
 
     def curve(

@@ -39,7 +39,10 @@ def _shifted(context: Context, link: int, direction: FloatArray) -> Design:
 
 
 def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
-    """Return the axes of the frame of a link, and its own direction where it is none of them."""
+    """Return 'along' a link with the frame's axes (x, y, z) not parallel to it, as unit vectors.
+
+    The axes alone for a link without length.
+    """
     shift = context.chain.T_fixed[link][:3, 3]
     length = np.linalg.norm(shift)
     axes = dict(zip('xyz', np.eye(3), strict=True))

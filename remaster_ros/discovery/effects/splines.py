@@ -113,7 +113,7 @@ class Curve:
 
     @property
     def heights(self) -> FloatArray:
-        """Heights of all splines of a unit of each free one, (m, m − 1)."""
+        """Heights of all splines by a unit of each free height, (m, m − 1)."""
         heights: FloatArray = np.delete(np.eye(len(self.weights)), self._pivot, axis=1)
         heights[self._pivot] = -self._others(self.weights) / self.weights[self._pivot]
         return heights
@@ -135,7 +135,7 @@ class Curve:
         return values if np.isnan(self.start) else in_turn(values, self.start)
 
     def seen(self, values: FloatArray, reach: float = 1.0) -> BoolArray:
-        """Return which values (n,) lie within so many knots of one that was visited."""
+        """Return whether values, (n,), are within `reach` knot steps of a visited value, (n,)."""
         at, visited = self.in_turn(values), self.visited
         if not np.isnan(self.start):
             visited = np.concatenate((visited[-1:] - TURN, visited, visited[:1] + TURN))
@@ -150,7 +150,10 @@ class Curve:
 
 
 def start_of_turn(values: FloatArray) -> float:
-    """Return the middle of the largest gap between angles, such that most of them stay."""
+    """Return the middle of the largest gap between angles, rad, less whole turns.
+
+    So that most angles are in the turn from there.
+    """
     at = np.sort(np.mod(values, TURN))
     gaps = np.append(at[1:], at[0] + TURN) - at
     widest = int(np.argmax(gaps))
@@ -177,7 +180,7 @@ def knot_vector(low: float, high: float, spacing: float) -> FloatArray:
 
 
 def basis(values: FloatArray, knots: FloatArray) -> FloatArray:
-    """Return the splines' values, (n, m), at values (n,); outside the knots those of the edge."""
+    """Return the splines at values (n,), (n, m); beyond the knots the values at the edge."""
     low, high = knots[DEGREE], knots[-DEGREE - 1]
     inside = np.clip(values, low, high)
     return np.asarray(scipy.interpolate.BSpline.design_matrix(inside, knots, DEGREE).toarray())

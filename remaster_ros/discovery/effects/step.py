@@ -38,7 +38,7 @@ def between(context: Context, low: float, high: float) -> Iterator[Candidate]:
 
 
 def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
-    """Zero-offsets; markers; sensors, which shift or also turn; the base where several see it."""
+    """Steps at the moments `chosen` of zero-offsets, markers, sensors, or all sensors together."""
     sensors: list[tuple[int, ...]] = [(index,) for index, _ in context.sensors('controller')]
     if len(sensors) > 1:
         sensors.append(tuple(index for (index,) in sensors))

@@ -58,7 +58,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def lagging(lag_s: float) -> Driver:
-    """Return the temperature of what follows the thermometer with a time constant, s."""
+    """Return the driver of a temperature that lags the thermometer by a time constant, s."""
     return replace(TEMPERATURE, value=lambda context: context.lagging_warming(lag_s))
 
 
@@ -80,7 +80,7 @@ def _has_length(context: Context, link: int) -> bool:
 
 
 def needs_warming(context: Context) -> str:
-    """Return why growth cannot be tested; '' where it can."""
+    """Return why growth cannot be tested; '' if it can."""
     if context.has_temperature or context.has_time:
         return ''
     return 'neither temperature nor time varies' if context.timed else NO_TIMES

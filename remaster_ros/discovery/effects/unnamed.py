@@ -232,7 +232,7 @@ def _sensor_turn(context: Context, sensor: int) -> FloatArray:
 
 
 def _sagging(context: Context, marker: int) -> Design:
-    """The marker's stem bends under its own weight, across the tool's z axis."""
+    """Columns of a marker's stem that bends under its weight, across the tool's z axis."""
     axis = context.tool[:, :3, 2]
     across = np.array((0.0, 0.0, -1.0)) + axis * axis[:, 2:]
     return displaced((context.marker == marker)[:, None] * across)

@@ -24,7 +24,7 @@ from remaster_ros.types import FloatArray
 
 
 class PlanPreview(PlanConfirmation):
-    """Draws the next plan beside the session's folder until it is confirmed."""
+    """Page of the next plan, beside the session's folder, until the plan is confirmed."""
 
     def __init__(
         self,
