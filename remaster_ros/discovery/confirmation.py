@@ -94,7 +94,7 @@ def rms_sigmas(rows: Sequence[Compared]) -> float:
 
 @dataclass(frozen=True)
 class ConfirmedCause:
-    """How a cause does in the other session."""
+    """Result of checking one cause on the other session."""
 
     rows_common: int  # Rows of the other session in which what drives the cause was seen here
     # Of what the other session could gain from this cause, beside the others fitted there, the

@@ -167,7 +167,10 @@ def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate,
 
 
 def _candidates(found: Discovery) -> list[Candidate]:
-    """Candidates of all effects that the session can show, except costly ones."""
+    """Candidates of all effects that the session can show, except costly ones.
+
+    Effects that move the fit itself are left out, too.
+    """
     context = found.residuals.context
     return [
         candidate

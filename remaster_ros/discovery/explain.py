@@ -164,7 +164,7 @@ class FoundEffect:
 
     @property
     def is_taken_out(self) -> bool:
-        """Whether the loaded result is fitted with this effect, as it is none of the arm.
+        """Whether results to be loaded are fitted with this effect, as an error of measurement.
 
         Where it may be nothing, lengths and offsets that imitate it may be right.
         """
@@ -360,7 +360,7 @@ class LessLikely:
 
 @dataclass(frozen=True)
 class SearchRecord:
-    """How far the chains of the walk agree.
+    """Agreement of the walk's chains.
 
     ``log_posterior``: of the best model of each chain, from the offsets alone and from all kinds
     of errors on; ``models``: models of a share worth mentioning; ``best_share``: of the best.
@@ -425,7 +425,10 @@ def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[Floa
 
 
 def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:
-    """Return which measurements distinguish two causes."""
+    """Return a text on the measurements that distinguish two causes.
+
+    ``same``: whether both displace this marker alike, so that none does.
+    """
     if same:
         return (
             'no pose of this marker can: both displace it alike '

@@ -120,7 +120,7 @@ class _Checks:
         return near & self.gross
 
     def _series(self) -> Iterator[IntArray]:
-        """Give the rows of each marker that each sensor measured, in the order of time."""
+        """Yield the rows of each sensor and marker, in the order of time."""
         context = self.data.context
         for sensor in range(len(context.sensor_names)):
             for marker in range(len(context.marker_names)):
@@ -179,7 +179,7 @@ class _Checks:
         return found
 
     def gross_held_out(self) -> Iterator[tuple[int, str]]:
-        """Give the single gross errors among the held-out rows, which no fit leaves out."""
+        """Yield observation and text of each single gross error among the held-out rows."""
         measurements = self.data.context.measurements
         gross = self.gross & measurements.is_validation & ~self.too_many
         for row in np.flatnonzero(gross).tolist():

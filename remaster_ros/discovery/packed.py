@@ -19,7 +19,7 @@ TILE = 128
 
 
 def length(size: int) -> int:
-    """Return how many numbers a matrix of so many rows takes."""
+    """Return the number of elements of a packed matrix of `size` rows."""
     return size * (size + 1) // 2
 
 

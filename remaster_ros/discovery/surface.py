@@ -474,7 +474,7 @@ class Walker:
             self._accept(state.with_block(*drawn), heat)
 
     def _accept(self, state: State, heat: float) -> None:
-        """Go to a model, by Metropolis."""
+        """Move to a model with the probability of Metropolis; note its log posterior."""
         self.seen[state.key] = state.value
         if np.log(self.rng.random()) < heat * (state.value - self.state.value):
             self.state = state

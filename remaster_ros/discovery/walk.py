@@ -79,7 +79,7 @@ Identity = tuple[str, tuple[int, ...], str, str, str, str]
 
 
 def identity(candidate: Candidate) -> Identity:
-    """Return which cause a candidate is, at whatever moment, order or axis."""
+    """Return the identity of a candidate's cause, without moment, order or axis."""
     change = '' if candidate.changes is None else 'ends' if candidate.ends else 'begins'
     return (
         candidate.name,

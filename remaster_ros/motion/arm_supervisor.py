@@ -439,7 +439,7 @@ class ArmSupervisor:
     # Inside: the rest of a move
 
     def _go_on_moving(self, wall_s: float) -> list[Action]:
-        """Give the controller the next piece of a move that is followed."""
+        """Actions that send the next piece of a move, if one is due; [] if not."""
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
             return []

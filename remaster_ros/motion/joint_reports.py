@@ -68,7 +68,7 @@ class JointReport:
 
 
 class ClockRate:
-    """How fast the node's clock runs beside the wall's; 1 for the system's clock.
+    """Rate of the node's clock, estimated from times read together; 1 for the system's clock.
 
     Attributes: ``rate``: seconds of the node's clock per second of wall time.
     """
@@ -78,7 +78,7 @@ class ClockRate:
         self.rate = 1.0
 
     def update(self, clock_s: float, wall_s: float) -> None:
-        """Take a pair of times read together, s."""
+        """Process the node's clock and the wall's, read together, s."""
         seen = self._seen
         if seen and clock_s < seen[-1][1]:
             # Set back: nothing before it counts.

@@ -44,13 +44,13 @@ class JointUnits:
         return float(np.max(np.abs(ways) / self.per_radian))
 
     def farthest(self, way: FloatArray) -> int:
-        """Return which joint has the largest of a way (k,)."""
+        """Return the index of the joint that moves farthest along a way, (k,)."""
         return int(np.argmax(np.abs(way) / self.per_radian))
 
     # As people read them
 
     def in_degrees(self, joint: int, value: float, digits: int = 2, sign: str = '') -> str:
-        """Return a joint's position or way in degrees, or in mm where it slides."""
+        """Return a joint's position or way as text, in degrees or, if it slides, in mm."""
         shown, unit = (1e3 * value, 'mm') if self.slide(joint) else (np.rad2deg(value), 'deg')
         return f'{shown:{sign}.{digits}f} {unit}'
 

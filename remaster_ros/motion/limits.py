@@ -56,7 +56,7 @@ class MotionLimits:
         tool_speed: float = np.inf,
         margin: float = 0.0,
     ) -> MotionLimits:
-        """Take the limits of a chain.
+        """Motion limits of a chain, in reported joint positions.
 
         A joint's stops are at true angles, which are the reported ones plus the offset: in
         reported angles the limits are shifted by minus the offset. The robot's own controller
@@ -105,7 +105,7 @@ class MotionLimits:
         return f'[{first.split()[0]}, {last.split()[0]}] {last.split()[1]}'
 
     def outside(self, q: FloatArray) -> str:
-        """Return which joint of `q` (rad or m, (k,)) lies outside, as text; '' if none does."""
+        """Return the joint of `q`, rad or m, (k,), that is outside its limits, as text; or ''."""
         bad = ~((self.lower + self.margins <= q) & (q <= self.upper - self.margins))
         if not np.any(bad):
             return ''

@@ -209,7 +209,7 @@ class MotionUnderWay:
 
     @property
     def near(self) -> float:
-        """How far from the end of a command the arm may stand, rad.
+        """Largest distance of an arm at rest from the end of a command, rad.
 
         What counts as still, and what the reports were off where it has stood: their noise, and
         what the servo leaves. Never more than the distance at which it counts as arrived.
@@ -261,12 +261,12 @@ class MotionUnderWay:
 
     @property
     def next_end(self) -> FloatArray | None:
-        """Where the next piece of the move ends, rad or m, (k,); None without a move."""
+        """End of the next piece of the move, rad or m, (k,); None without a move."""
         return None if self.visit is None or self._piece is None else self._piece.next_end
 
     @property
     def patience_s(self) -> float:
-        """How much later than due the next piece of a move may come, s of robot time."""
+        """Longest delay of the next piece of a move after it is due, s of robot time."""
         if not self._keeps_stamps:
             return STEP_REST_S
         return self._horizon_s - RAMP_S - GUARD_S - RENEWED_S

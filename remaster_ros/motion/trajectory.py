@@ -176,7 +176,10 @@ class Trajectory:
         return tuple(points)
 
     def line_at(self, time_s: float) -> tuple[int, float]:
-        """Return which line is under way (or rested on) at a time, and since when, s."""
+        """Return the index of the line under way at a time, and the time since its start, s.
+
+        A rest after a line belongs to the line.
+        """
         index = max(bisect_right(self.starts_s, time_s) - 1, 0)
         return index, time_s - self.starts_s[index]
 

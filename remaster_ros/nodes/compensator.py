@@ -129,7 +129,7 @@ class _Goal:
 
 
 class CompensatorNode(RemasterNode):
-    """See the module's text."""
+    """Node that corrects other planners' trajectories, and publishes true joint angles."""
 
     # Without it nobody stops what it has passed on: it does so itself, and stays.
     outlives_faults = True
@@ -247,7 +247,7 @@ class CompensatorNode(RemasterNode):
         self._described = self._described_trouble()
 
     def _described_trouble(self) -> str:
-        """Return how the description contradicts the correction; ''."""
+        """Return how the robot description contradicts the correction, or ''."""
         topic = self.resolve_topic_name(DESCRIPTION)
         if self._description is None:
             return (

@@ -103,7 +103,7 @@ class ForeignGoals:
         self._earlier = set(self._active)
 
     def trouble(self) -> str:
-        """Return that another client has a goal under way, ''."""
+        """Return a sentence that another client has a goal under way, or ''."""
         if self._active <= self.own | self._earlier:
             return ''
         return f'another client has sent a goal to {self._action}: end that client'
@@ -225,7 +225,7 @@ class ActionLink:
     listens = matched
 
     def rival(self) -> str:
-        """Return which other node is a client of the action, ''."""
+        """Return a sentence on another node that is a client of the action, or ''."""
         service = f'{self._action}/_action/send_goal'
         if self._node.count_clients(service) <= 1:
             return ''
@@ -282,7 +282,7 @@ class ActionLink:
         self._copies.publish(message)
 
     def cancel(self) -> None:
-        """Let the controller hold the arm where it is, as no command is to follow."""
+        """Cancel all goals, so that the controller holds the arm; no command is to follow."""
         for goal in self._goals:
             if goal.handle is not None and not (goal.cancelled or goal.over):
                 self._await(goal.handle.cancel_goal_async(), self._on_cancelled, goal)

@@ -171,7 +171,7 @@ class PrecisionWatch:
 
 
 class Optimizer(RemasterNode):
-    """See the module's text."""
+    """Node that fits the session, or searches it for causes, on request."""
 
     # It moves nothing, and no node depends on it: what fails can be called again.
     outlives_faults = True

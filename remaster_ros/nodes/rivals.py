@@ -61,7 +61,10 @@ class OnlyPublisher:
         return self._words(listed) if known and self._alive + self._own() > self._allowed else ''
 
     def _own(self) -> int:
-        """Return how many publishers are this node's own: Fast DDS counts no lease of theirs."""
+        """Return the number of this node's own publishers, whose leases are not counted.
+
+        Fast DDS reports no lease of a node's own publishers.
+        """
         return sum(publisher.topic_name == self._topic for publisher in self._node.publishers)
 
     def _count(self) -> None:

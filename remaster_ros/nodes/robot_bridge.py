@@ -353,7 +353,7 @@ class EmergencyLink:
 
 
 class RobotBridge(RemasterNode):
-    """See the module's text."""
+    """Node that commands the joint solutions of a pose, and publishes when the arm has settled."""
 
     # Without it nobody looks at the arm: it stops and halts the arm, and stays.
     outlives_faults = True

@@ -370,7 +370,7 @@ class SensorNode(RemasterNode):
             self._ending.wait(RETRY_S)
 
     def _require_start(self, error: RemasterError) -> None:
-        """End the node with this error where the device has never worked and the time is over."""
+        """End the node with this error if the device has not worked within the time to start."""
         over = time.monotonic() > self._start_by
         if over and not (self._started or self._ending.is_set()):
             self.failure = error

@@ -204,7 +204,7 @@ class NodeStatus:
             )
 
     def _namesakes(self) -> int:
-        """Return how many publishers of the records are of nodes with this node's name."""
+        """Return the number of publishers of records by nodes of this name, itself included."""
         own = self._node.get_name(), self._node.get_namespace()
         found = self._node.get_publishers_info_by_topic(self._events.topic_name)
         return sum((info.node_name, info.node_namespace) == own for info in found)

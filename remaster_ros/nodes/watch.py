@@ -93,7 +93,7 @@ class Parameters:
 
 
 class Watch(RemasterNode):
-    """See the module's text."""
+    """Node that serves the live page, whose buttons call the services of other nodes."""
 
     # It moves nothing, and no node depends on it.
     outlives_faults = True

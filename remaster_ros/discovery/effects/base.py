@@ -253,7 +253,7 @@ class Effect:
         parameters: Sequence[str],
         **more: Any,
     ) -> Iterator[Candidate]:
-        """Give a candidate for each of some joints (1-based), which adds to that joint's angle.
+        """Yield a candidate for each of some joints (1-based), which adds to that joint's angle.
 
         ``joints``: which of the context's; ``features``: context and joint to m added angles, rad
         or m per unit, (n,) each; ``parameters``: names of the m parameters, with ``{joint}`` for

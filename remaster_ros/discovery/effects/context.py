@@ -32,7 +32,7 @@ BLOCK_ROWS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """What effects may depend on: n rows, k joints."""
+    """Measurements and fitted model on which effects may depend: n rows, k joints."""
 
     chain: SerialChain  # The nominal robot
     # All rows; ``sensor`` and ``marker`` are indices into the names below
@@ -177,7 +177,7 @@ class Context:
 
     @cached_property
     def warming(self) -> FloatArray:
-        """Temperature above the first known one, K, (n,); 0 where unknown."""
+        """Temperature above the first known temperature, K, (n,); 0 if unknown."""
         given = self.measurements.temperature_c
         known = np.isfinite(given)
         if not known.any():
@@ -278,7 +278,7 @@ class Context:
         ]
 
     def seen_by(self, sensor: int) -> BoolArray:
-        """Return which rows a sensor measured, (n,)."""
+        """Return whether a sensor measured each row, (n,)."""
         return self.sensor == sensor
 
     @cached_property

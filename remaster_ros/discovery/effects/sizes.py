@@ -58,7 +58,7 @@ def of_joint(context: Context, joint: int, values: FloatArray) -> str:
 
 
 def span_of(context: Context, joint: int, span: float) -> str:
-    """Return how far a joint (1-based) goes, rad or m: '90°' or '600 mm'."""
+    """Return a joint's (1-based) span as text: '90°' or '600 mm'."""
     shown = context.chain.shown_scale[joint - 1] * span
     return f'{shown:.0f} mm' if context.slides(joint) else f'{shown:.0f}°'
 
