@@ -63,6 +63,8 @@ def plan_tour(
     InputError
         If the inverse kinematics of this robot cannot be solved, or it can reach no pose to fit.
     """
+    if not counts.get('optimization'):
+        raise InputError('no pose to fit is asked for; give at least one')
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
     sensors_R = scene.rough_R
     if places is not None:

@@ -319,3 +319,8 @@ def test_a_program_is_told_what_is_wrong(options, words):
     with pytest.raises(InputError) as refused:
         remaster_ros.simulate(poses=8, validation_poses=2, **options)
     assert words in str(refused.value)
+
+
+def test_a_simulation_without_a_pose_to_fit_is_refused():
+    with pytest.raises(InputError, match='no pose to fit is asked for'):
+        remaster_ros.simulate(poses=0)
