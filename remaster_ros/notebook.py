@@ -48,6 +48,7 @@ class Fit(FitResult):
         return '\n'.join(fit_lines(fit_content(self)))
 
     def _repr_html_(self) -> str:
+        """First screen of the report of this fit, as HTML."""
         from remaster_ros.reports.report import fit_html
 
         return _first_screen(fit_html(self, {}))
@@ -92,12 +93,14 @@ class Found(Discovery):
         return '\n'.join(discovery_lines(self._content))
 
     def _repr_html_(self) -> str:
+        """First screen of the report of this search, as HTML."""
         from remaster_ros.reports.report import discovery_html
 
         return _first_screen(discovery_html(self._content, self.fit.session, {}))
 
     @cached_property
     def _content(self) -> Discovered:
+        """Content of discovery.json, computed once."""
         from remaster_ros.reports.discovery_json import discovery_content
 
         return discovery_content(self)

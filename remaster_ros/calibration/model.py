@@ -354,6 +354,7 @@ class Model:
         return self._pose(self._inner_offsets(z), z, rows)
 
     def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
+        """Pose of the arm in each row by offsets (…, k) and parameters x, effects included."""
         turns, shifts = self._extended(x, rows)
         shifts = shifts @ self._transform_of_first_joint(offsets[0])[:3, :3].T
         angles = rows.q + offsets
@@ -369,6 +370,7 @@ class Model:
         return Pose(tool, points + shifts, self.chain.axes_in_base(frames), by_joints)
 
     def _inner_offsets(self, z: FloatArray) -> FloatArray:
+        """Joint offsets, rad or m, (..., k), with those of joints 1 and k set to 0."""
         offsets = self.offsets(z).copy()
         offsets[..., [0, self.joints - 1]] = 0.0
         return offsets
@@ -381,6 +383,7 @@ class Model:
         return given.turns(theta, rows.source), given.shifts(theta, rows.source)
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
+        """Derivative of `predict` by all parameters at given offsets (…, k), (n, 3, size)."""
         derivative = np.zeros((len(rows.q), 3, self.size))
         tool, points, axes, by_joints = self._pose(offsets, x, rows)
         base, turned = self._transform_of_first_joint(offsets[0])[:3, :3], by_joints

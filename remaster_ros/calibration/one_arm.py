@@ -111,6 +111,10 @@ class _SessionOffsets:
 
     @classmethod
     def of(cls, found: Estimate) -> _SessionOffsets:
+        """Zero-offsets of a fit, with their covariance and response to links and axes.
+
+        Standard deviations are at least those of the robust estimate.
+        """
         mode, problem = found.mode.of_points, found.problem
         posterior = mode.linearisation.posterior
         model, free = posterior.model, posterior.free

@@ -114,6 +114,7 @@ def tool_orientations(
 
 
 def _modelled(model: Model, measurements: Measurements, z: FloatArray) -> FloatArray:
+    """Orientation of the tool in each row's sensor frame, (n, 3, 3), by pinned parameters z."""
     x = model.natural(z)
     R_R_T = model.chain.forward(measurements.q, model.offsets(x))[:, :3, :3]
     R_R_N = model.T_R_N(x)[measurements.sensor, :3, :3]

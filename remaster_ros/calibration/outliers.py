@@ -236,6 +236,10 @@ def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str
 
 
 def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
+    """Raise MisfitError if over `LARGEST_SHARE` of a sensor's observations are gross.
+
+    One gross error is always allowed.
+    """
     names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
         gross_count, count = int(gross[span].sum()), span.stop - span.start

@@ -73,6 +73,7 @@ class PathNoise:
         return self._correlations(sensor, rows, share, scale)
 
     def _correlations(self, sensor: int, rows: IntArray, share: float, scale: float) -> FloatArray:
+        """Correlations of a sensor's rows, (n, n), with their lengths times `scale`."""
         lengths = float(self.length_m[sensor]), float(self.length_rad[sensor])
         d = _distance(self.position[rows], self.turn[rows], *lengths)
         return _correlations(d / scale, share, int(self.order[sensor]))
@@ -239,6 +240,10 @@ def _minimised(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[
 
 
 def _natural(logs: FloatArray) -> tuple[float, float, float]:
+    """Share of the process and its lengths, m and rad, all clipped to their ranges.
+
+    From (3,): logit of the share, logs of the lengths over their starts.
+    """
     share = float(np.clip(1.0 / (1.0 + np.exp(-logs[0])), *RANGE_SHARE))
     length_m = float(np.clip(START_M * np.exp(logs[1]), *RANGE_M))
     length_rad = float(np.clip(START_RAD * np.exp(logs[2]), *RANGE_RAD))

@@ -129,6 +129,7 @@ class Posterior:
         return np.concatenate(parts).reshape(points.shape[:-1])
 
     def _log_density(self, points: FloatArray) -> FloatArray:
+        """Log posterior density of points (..., d), up to a constant; -inf outside the bounds."""
         z = self.parameters(points)
         eta = points[..., len(self.free) :]
         errors = self.rows.target - self.model.predict(z, self.rows)

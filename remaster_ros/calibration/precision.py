@@ -129,6 +129,10 @@ class Precision:
         return self._tool_rms(self.covariance)
 
     def _joint_rms(self, covariance: FloatArray) -> float:
+        """Root mean square of joints' std by a covariance (f, f), rad; infinite without any.
+
+        Only identifiable joints count.
+        """
         variances = [
             covariance[i, i] / unit**2
             for i, unit in zip(self.joints, self.per_radian, strict=True)
@@ -150,6 +154,7 @@ class Precision:
     def _shortfall(
         self, covariance: FloatArray, joint_std: float | None, tool_std: float | None
     ) -> float:
+        """Largest ratio of std to wanted std by a covariance (f, f); 0 if none is wanted."""
         joints = 0.0 if joint_std is None else self._joint_rms(covariance) / joint_std
         tool = 0.0 if tool_std is None else self._tool_rms(covariance) / tool_std
         return max(joints, tool)

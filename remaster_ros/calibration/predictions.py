@@ -175,6 +175,7 @@ class _RowBlock:
 
     @classmethod
     def of(cls, fit: FitResult, rows: Rows, triangle: FloatArray) -> _RowBlock:
+        """Predicted rows and noise; `triangle`: U with U'U the covariance of the parameters."""
         predictive = fit.predictive
         model = predictive.model
         sensor = rows.group_sensor[rows.group_of_row]

@@ -188,6 +188,10 @@ class AdaptedProposal:
         return max(1, BLOCK_ENTRIES // self.dimension**2)
 
     def _log_density(self, inner: FloatArray) -> FloatArray:
+        """Log density (n,) of inner coordinates (n, d): main part and tails.
+
+        The common parts of the noise count as mirrored at zero.
+        """
         # |x| has the density of x and of -x together.
         kept = (1.0,) * (self.dimension - self._shares)
         parts = []

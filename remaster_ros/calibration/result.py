@@ -348,7 +348,10 @@ class FitResult:
 
     @property
     def displaced_markers(self) -> tuple[str, ...]:
-        """Line for each marker that is not at its stated position within the stated accuracy."""
+        """Line for each marker off its stated position by over `DISPLACED` stated stds.
+
+        () if the fit has no estimate.
+        """
         if self.found is None:
             return ()
         problem, link = self.found.problem, self.session.tip_link
@@ -408,10 +411,10 @@ class Sampled:
 def sampled_columns(
     posterior: Posterior, x: FloatArray, eta: FloatArray, moved: IntArray
 ) -> FloatArray:
-    """Columns (..., p) of a fit's chains by natural parameters x (..., size) and noise.
+    """Values of a fit's chains, (..., p): moved parameters of x, every sigma, known common parts.
 
-    The moved parameters, every channel's sigma, and its common parts if they are known; ``eta``:
-    noise coordinates, (..., e).
+    ``x``: natural parameters, (..., size); ``eta``: noise coordinates, (..., e); ``moved``:
+    indices of the sampled parameters.
     """
     noise = posterior.noise(eta)
     shared = posterior.noise_model.shared(noise)

@@ -143,6 +143,7 @@ def _seconds(created: str) -> float:
 
 
 def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
+    """Record of a check for the history: baseline, arm, session, readings, and time if known."""
     return {
         'format': HISTORY,
         'baseline_sha256': baseline.sha256,
@@ -275,6 +276,10 @@ def content_of(
 
 
 def _trend(found: CheckResult, joint_names: tuple[str, ...], names: list[str]) -> dict[str, Any]:
+    """Trend of the checks for JSON: kind, joints by name, size and half width, mm, and since when.
+
+    `found.trend` may not be None.
+    """
     one = found.trend
     assert one is not None
     return {
@@ -298,6 +303,7 @@ def _next_date(found: CheckResult) -> str | None:
 
 
 def _next_in_words(found: CheckResult) -> str:
+    """Sentence on the next check: a date if times are known, else a number of usual intervals."""
     if (date := _next_date(found)) is not None:
         return f'Next check on {date}.'
     if (more := math.ceil(found.next_in)) > 1:
@@ -416,6 +422,7 @@ def _named(found: CheckResult, names: list[str]) -> str:
 
 
 def _text(content: dict[str, Any]) -> str:
+    """Text of a check's result for people, from its JSON: verdict, a line per joint, evidence."""
     drifts = content['trend'] is not None and content['trend']['kind'] == 'drift'
     # The sentence of a drift begins with the word.
     lines = [content['text'] if drifts else f'{content["verdict"]}: {content["text"]}']

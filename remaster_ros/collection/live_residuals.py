@@ -105,11 +105,16 @@ class LiveResiduals:
         return self._fitted(sensor)[1]
 
     def _fitted(self, sensor: str) -> tuple[FloatArray, FloatArray]:
+        """`_fit` of a sensor, computed only after its pairs, markers or offsets have changed."""
         if sensor not in self._found:
             self._found[sensor] = self._fit(sensor)
         return self._found[sensor]
 
     def _fit(self, sensor: str) -> tuple[FloatArray, FloatArray]:
+        """Lengths of a sensor's residuals, (n,), and measured positions in R, (n, 3), m.
+
+        The sensor is registered by its pairs; empty if they are too few or do not register it.
+        """
         pairs = self._pairs[sensor]
         nothing = np.empty(0), np.empty((0, 3))
         if len(pairs) < FEWEST:

@@ -315,6 +315,7 @@ class Pairing:
         return waited
 
     def _set(self, item: PairedReading | Rejection) -> None:
+        """Set the decision on a sensor and its time; an earlier decision stays."""
         if item.sensor not in self.decided:
             self.decided[item.sensor] = item
             self._decided_s[item.sensor] = self._now_s
@@ -328,6 +329,7 @@ class Pairing:
         return np.inf if self._patient else rules.allowed_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
+        """Rejection of a sensor after `allowed` s: too few samples, or none that can be used."""
         count = max(len(_seen(part)) for part in self._by_marker(rules).values())
         if 0 < count < rules.min_samples and not rules.single_shot:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
@@ -337,6 +339,7 @@ class Pairing:
         return Rejection(rules.sensor, 'stale', detail)
 
     def _decide(self) -> None:
+        """Decide on each sensor whose readings are complete and followed by a joint state."""
         for name, rules in self.rules.items():
             used = None if name in self.decided else self._used(rules)
             # Only a joint state after the end of the dwell shows standstill until the end.
@@ -420,6 +423,10 @@ class Pairing:
     def _judge(
         self, rules: SensorRules, end: float, marker: str, used: list[MarkerReading]
     ) -> PairedReading | Rejection:
+        """Paired mean of a marker's used readings until `end`, s, or a Rejection.
+
+        The arm moved or was unseen, or the readings are scattered, unsteady or frozen.
+        """
         if rules.single_shot:
             end = used[0].stamp_s
         stamps = np.array([stamp for stamp, _ in self._joints])

@@ -38,7 +38,10 @@ class PeerModels:
         self._peers: dict[str, tuple[float, str]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Process the record of any node; wall time, s."""
+        """Compare the arm in another node's record with this one's; `now`: wall time, s.
+
+        A planner that names no arm is a fault; records of this node are ignored.
+        """
         if record.node == self._node:
             return
         if record.model is not None:
@@ -152,7 +155,7 @@ class Peers:
         return heard.body if heard and isinstance(heard.body, RecorderState) else None
 
     def required(self) -> RequiredSensors:
-        """Sensors that the arm waits for, by the recorder's settings.
+        """Sensors that the arm waits for, by the recorder's settings; all before they came.
 
         Raises InputError if the recorder waits for a sensor that this cell does not have.
         """
@@ -176,6 +179,11 @@ class Peers:
         )
 
     def _sensor_facts(self, name: str, now: float, seen_before: bool) -> SensorFacts:
+        """Facts on a sensor: age of node and reading, s, whether it is ready, and its message.
+
+        A sensor without a report is not ready; the age of its reading is 0 if it was
+        `seen_before`.
+        """
         nothing = SensorReport(sensor=name, ready=False), -NEVER_S
         report, came = self._reports.get(name, nothing)
         age_s = None if self.recorder is None else self.recorder.read_age_s.get(name)

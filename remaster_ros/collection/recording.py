@@ -267,6 +267,7 @@ class Recording:
         self.begin(SettledArm(q, stamp_s, BY_HAND, 0))
 
     def _new_pairing(self, settled: SettledArm) -> Pairing:
+        """Pairing of a settled configuration, with the kept joint states and readings added."""
         pairing = Pairing(
             settled.stamp_s,
             settled.q,
@@ -360,6 +361,7 @@ class Recording:
         return item.inverted()
 
     def _count_unseen(self, accepted: Sequence[PairedReading]) -> None:
+        """Count configurations in a row in which a sensor measured, but not this marker of it."""
         seen = {(reading.sensor, reading.marker) for reading in accepted}
         measured = {reading.sensor for reading in accepted}
         for rules in self._rules:

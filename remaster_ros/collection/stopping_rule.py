@@ -213,6 +213,7 @@ class StoppingRule:
         return f'about {look.more} more configurations to fit{time}{planned}'
 
     def _structure(self, found: Estimate, count: int) -> tuple[StructureTest, ...]:
+        """Significant structure in the residuals, by p-value; () if no test is due."""
         limit = self.limit(count)
         if limit == 0.0:
             return ()
@@ -223,6 +224,7 @@ class StoppingRule:
     def _lacking(
         self, found: Estimate, precision: Precision, structure: tuple[StructureTest, ...]
     ) -> str:
+        """Reason why the goal is not reached after a look; '' if reached or none is stated."""
         goal, needed = self.goal, FREEDOM_PER_PARAMETER * precision.parameters
         if not goal.stated:
             return ''

@@ -34,7 +34,7 @@ class PlanMemory(Protocol):
         """Begin a visit."""
 
     def drop_remaining_fits(self) -> None:
-        """Drop the remaining poses to fit."""
+        """Record that the remaining poses to fit are dropped."""
 
 
 class Planning(Protocol):

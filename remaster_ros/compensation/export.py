@@ -132,7 +132,7 @@ def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str
 
 
 def check_first(result: FitResult) -> list[str]:
-    """Checks before anything is loaded, a line each."""
+    """'CHECK FIRST: ' line for each implausible value of the result; [] if there is none."""
     return [f'CHECK FIRST: {line}' for line in result.implausible]
 
 

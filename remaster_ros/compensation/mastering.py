@@ -145,7 +145,7 @@ def mastering(
 
 
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
-    """True positions at which the joints are set, rad or m, (k,): 0 if it can be reached."""
+    """True positions where joints are set, rad or m, (k,): 0, or mid-range if beyond limits."""
     turn = np.where(chain.slides, np.inf, np.pi)
     lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
     step = np.where(chain.slides, _STEP_MM / _MM_PER_M, np.radians(_STEP_DEG))

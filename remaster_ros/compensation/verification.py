@@ -182,7 +182,10 @@ class _ProjectedRows:
         return apply(self.compensator.tool(q), self.places)
 
     def projected(self, columns: FloatArray) -> FloatArray:
-        """Columns in rows of R, projected on the complement of the fit of base and marker."""
+        """Part of columns (3 n, …) in R that the fit of base and markers cannot absorb.
+
+        As coordinates in an orthonormal basis of the complement of that fit.
+        """
         found: FloatArray = self._complement.T @ columns
         return found
 

@@ -434,7 +434,10 @@ class _Both:
             value, (both, best) = max(values), tried[int(np.argmax(values))]
 
     def judged(self, best: Choices, index: int, rows: BoolArray) -> ConfirmedCause:
-        """Judge one cause, all others at their best choices; RMS errors are those of `rows`."""
+        """Judge one cause, all others at their best choices; RMS errors are those of `rows`.
+
+        A cause without a candidate in `found` has 0 rows and NaN errors.
+        """
         group = self.groups[index]
         if not group:
             return ConfirmedCause(0, np.nan, np.nan, np.nan, ())
@@ -565,7 +568,10 @@ class _Both:
 def _compared(
     names: Sequence[str], unit: str, values: FloatArray, covariance: FloatArray
 ) -> list[Compared]:
-    """Compare values of this session, then of the other, (2 n,), by their covariance."""
+    """Compare n values of this session with those of the other, (2 n,): difference in sigmas.
+
+    This session's values come first; the difference is NaN if its standard deviation is 0.
+    """
     found, n = [], len(names)
     variance = np.diag(covariance)
     for i, name in enumerate(names):

@@ -384,7 +384,10 @@ def _sampled(
 def _judged(
     found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
 ) -> Residuals:
-    """Return the residuals of the rows of the pool that a model does not show to be gross."""
+    """Residuals of the pool's rows that are not gross in the model.
+
+    `residuals` itself if the rows are the same, or if too few would be left.
+    """
     every = residuals.only(pool)
     gross = None
     for left in _left_by_moment(every, solution):

@@ -302,6 +302,7 @@ def _also_called(alike: Sequence[LookAlike]) -> str:
 
 
 def _joints(group: Sequence[Candidate]) -> tuple[int, ...]:
+    """Joints of a group of candidates: in their order if all have the same, else sorted."""
     if len({candidate.joints for candidate in group}) == 1:
         return group[0].joints
     return tuple(sorted({joint for candidate in group for joint in candidate.joints}))

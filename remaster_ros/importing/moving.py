@@ -256,6 +256,10 @@ class _Recording:
         return self._session(joined, dict(zip(names, clocks_s.tolist(), strict=True)))
 
     def _held_out(self, pose: IntArray, rng: np.random.Generator) -> BoolArray:
+        """Whether each row is held out: a random segment of each of consecutive runs.
+
+        Runs are about as many as `hold_out` times the segments; none is held out if that is 0.
+        """
         segments = np.unique(pose)
         if not self.options.hold_out:
             return np.zeros(len(pose), bool)
@@ -263,6 +267,10 @@ class _Recording:
         return np.isin(pose, [rng.choice(run) for run in runs])
 
     def _session(self, measurements: Measurements, clock_offset_s: dict[str, float]) -> Session:
+        """Session of the rows; markers without a stated position are at the tip.
+
+        `marker_std_m` is then `UNKNOWN_MARKER_STD_M`, unless it is stated.
+        """
         options = self.options
         known = all(name in options.places for name in self.markers)
         std = 0.5e-3 if known else UNKNOWN_MARKER_STD_M

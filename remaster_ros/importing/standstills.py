@@ -164,7 +164,10 @@ def _quietest(stream: Stream) -> float:
 
 
 def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
-    """Runs in which all values stay within `tolerance`, of at least `fewest` values."""
+    """Runs, longer than `SWING_S`, of at least `fewest` values that span `tolerance` or less.
+
+    A gap between stamps ends a run.
+    """
     stamps, values = stream.stamps, stream.values
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
     gap = max(SettleRules().max_gap_s, _FEWEST_ROWS * step)

@@ -38,10 +38,12 @@ class ConvexDistances:
 
     @cached_property
     def _objects(self) -> list[tuple[Any, FloatArray]]:
+        """Coal's object of each shape and its pose in the frame of T, (4, 4), made once."""
         return [self._object(shape, T) for shape, T in self._shapes]
 
     @cached_property
     def _request(self) -> Any:
+        """Coal's request for signed distances, whichever version of coal is installed."""
         request = self._coal.DistanceRequest()
         if hasattr(request, 'enable_signed_distance'):  # the older one always does
             request.enable_signed_distance = True

@@ -78,7 +78,7 @@ def axes_apart(chain: SerialChain, description: str) -> float:
 
 
 def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool] | str:
-    """Return the arm of a description, and whether it has the base link and the tip link.
+    """Return a description's arm, whether it has base and tip link; or why it is another.
 
     Text that says why the description is of another arm, if it is.
     """

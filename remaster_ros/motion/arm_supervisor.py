@@ -167,7 +167,10 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:
-        """Process the recorder's answer that a settled configuration is done; return actions."""
+        """Process the recorder's answer that a settled configuration is done; return actions.
+
+        The actions of `tick` are always included; an answer on another solution has no others.
+        """
         actions: list[Action] = []
         visit = self._motion.visit
         measures = self.state is Arm.MEASURES

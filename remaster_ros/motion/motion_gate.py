@@ -429,6 +429,7 @@ class ForeignGate:
 
 
 def _too_long() -> str:
+    """Reason of a refusal: the motion would take longer than `LONGEST_S`."""
     return f'it would take longer than {LONGEST_S / 3600.0:.0f} h with these limits of speed'
 
 

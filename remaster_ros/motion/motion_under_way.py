@@ -307,6 +307,7 @@ class MotionUnderWay:
         return Renew(admitted, wall_s, begins_s)
 
     def _take(self, piece: Piece | None, sent_s: float, set_back_s: float = 0.0) -> None:
+        """Make a piece the present one, sent at `sent_s` of the motion; keep the previous one."""
         self._piece_before = self._piece, self._piece_sent_s
         self._set_back_s = set_back_s
         self._piece, self._piece_sent_s = piece, sent_s

@@ -61,6 +61,7 @@ class Background:
                 self._guard.trigger()
 
     def _deliver(self) -> None:
+        """Call `then` with the result of every finished job, among the node's callbacks."""
         while self._results:
             then, result = self._results.popleft()
             then(result)

@@ -216,6 +216,7 @@ class CompensatorNode(RemasterNode):
         self.create_timer(WATCH_S, self._look, clock=self._steady)
 
     def _read(self) -> Any:
+        """Read the correction in use from the file of the parameter `compensation`."""
         from remaster_ros.compensation.in_use import CorrectionInUse
 
         return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)

@@ -305,6 +305,7 @@ class ActionLink:
         future.add_done_callback(partial(self._take, done, goal))
 
     def _take(self, done: Callable[[_Goal, Any], None], goal: _Goal, future: Future) -> None:
+        """Process the answer to a request of a goal, unless it was cancelled or is empty."""
         self._awaited.remove(future)
         if not future.cancelled() and future.result() is not None:
             done(goal, future.result())

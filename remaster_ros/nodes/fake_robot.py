@@ -122,6 +122,7 @@ class FakeRobotNode(RemasterNode):
             wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 
     def _on_taken(self, message: Header) -> None:
+        """Record how far a process, by its id, has processed messages; ignore a malformed id."""
         pid, _, what = message.frame_id.partition(' ')
         if pid.isdecimal():
             self._pace.took(int(pid), seconds(message.stamp), leads=what == LEADS)

@@ -153,6 +153,7 @@ def fake_nodes(params: str, namespace: str = '', dashboard: str = 'false') -> li
 
 
 def _is_true(name: str, text: str) -> bool:
+    """Whether a launch argument is 'true'; InputError if it is neither 'true' nor 'false'."""
     if text.lower() not in ('true', 'false'):
         raise InputError(f'{name}:={text}: true or false is needed')
     return text.lower() == 'true'

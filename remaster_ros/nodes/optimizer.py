@@ -278,6 +278,7 @@ class Optimizer(RemasterNode):
         return report, '; '.join(words)
 
     def _progress(self, stage: str, share: float) -> None:
+        """Show stage and share of a fit as the state; RemasterError if the node is ending."""
         if self._ending:
             raise RemasterError('stopped')
         self._state = f'{stage} {100 * share:.0f} %'
@@ -310,6 +311,7 @@ class Optimizer(RemasterNode):
         self._ending = True
 
     def _summary(self) -> Summary:
+        """Summary of the node's state for diagnostics; its level is 'error' after a failed fit."""
         level = 'error' if self._failed else 'ok'
         values = {'session': self.p.session, 'out': self.p.out}
         return Summary(level, self._state, values, self._watch.state)

@@ -242,6 +242,7 @@ class _Outlet(Outlet):
         self._node._registrations.publish(message)
 
     def measure(self) -> None:
+        """Trigger the single-shot sensors of the present reading, if any; none from a bag."""
         pairing = self._node.recorder.recording.pairing
         if pairing is not None and not self._node.recorder.from_bag:
             self._node.sensors.trigger(pairing)

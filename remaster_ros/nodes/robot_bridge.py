@@ -580,6 +580,7 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.plan(targets, self.steady_s(), waypoints, refused))
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
+        """Process a report of the joints, then count its message as taken."""
         self._take_report(message, info)
         # Last: what was decided by this report has been published.
         self._taken.take(message.header.stamp)

@@ -92,6 +92,7 @@ class NameLock:
         self._close()
 
     def _close(self) -> None:
+        """Close the lock's file, if open; the lock ends once no process has the file open."""
         file, self._file = self._file, -1
         if file >= 0:
             os.close(file)

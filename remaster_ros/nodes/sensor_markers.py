@@ -130,6 +130,7 @@ class MeasureService:
             self._T_N_R = transforms.inverse(transform_array(message))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
+        """Note when a commanded trajectory arrives, s; ignore one of a single point, a stop."""
         # One point alone is a stop on the way, where nothing is to be found.
         if len(message.points) > 1:
             self._arrival_s = self._node.now_s() + seconds(message.points[-1].time_from_start)

@@ -277,6 +277,7 @@ def pairs(state: State) -> dict[str, str]:
 
 
 def _text(value: Any) -> str:
+    """Value as text: yes or no, a float with one decimal, 'none' for None."""
     if isinstance(value, bool):
         return 'yes' if value else 'no'
     return f'{value:.1f}' if isinstance(value, float) else 'none' if value is None else str(value)

@@ -198,6 +198,7 @@ class Watch(RemasterNode):
             self.view.take_plan_page(PlanPage(plan, self.page.show_plan(found)))
 
     def _on_joint_state(self, message: JointState) -> None:
+        """Keep the positions of the arm's joints for the page; ignore reports of other joints."""
         if self._order.concerns(message):
             self._q = self._order.positions(message)
             self.view.take_joints(self._q)

@@ -178,7 +178,10 @@ def _exchanged(
 
 
 def _smallest(signals: FloatArray) -> float:
-    """Return the smallest singular value of signals of a rigid motion (m, 3 S, 6), centred."""
+    """Smallest singular value of signals of a rigid motion, (m, 3 S, 6), all-zero rows left out.
+
+    Rotations count about the centre of the references.
+    """
     flat = signals.reshape(-1, signals.shape[-1])
     flat = flat[np.any(flat != 0.0, axis=1)]
     shifts, rotations = flat[:, :3], flat[:, 3:]

@@ -166,7 +166,7 @@ def _candidates(context: Context, name: str) -> list[Candidate]:
 
 
 def _shifts(context: Context, candidates: Sequence[Candidate]) -> FloatArray:
-    """Return the displacements per unit of the parameters of candidates, m, (n, 3, m)."""
+    """Return displacements per unit of the parameters of one or more candidates, m, (n, 3, m)."""
     return np.concatenate([c.columns(context).displacement(context) for c in candidates], axis=2)
 
 

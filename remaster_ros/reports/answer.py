@@ -193,7 +193,7 @@ def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
 def _model(
     session: Session, result: Path, file: str, verb: str
 ) -> tuple[Path | None, FloatArray | None]:
-    """Path of a result's robot model and the errors with it, mm; None if there is no model."""
+    """Path of a result's robot model and the errors with it, mm; both None if `file` is ''."""
     if not file:
         return None, None
     path = result.parent / APPLY_FOLDER / MODEL_FILE

@@ -81,7 +81,7 @@ def discovery_content(
     predictions: Predictions | None = None,
     decided: Sequence[Decision] = (),
 ) -> Discovered:
-    """Content of discovery.json; predictions are computed if not given."""
+    """Checked content of discovery.json, as an object; predictions are computed if not given."""
     predictions = predictions_of(discovery) if predictions is None else predictions
     fit = estimates(discovery.fit)
     before, before_std = discovery.offsets_before

@@ -397,7 +397,7 @@ def _joint_panels(
 
 
 def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
-    """Figure of panels one below the other."""
+    """Figure of `count` panels one below the other, each `height_in` inches high, and its axes."""
     return _panels(height_in * count + 0.2, (count, 1), left=0.65, bottom=0.5, top=0.3, down=0.8)
 
 
@@ -437,7 +437,7 @@ def _write_instead(ax: Axes, text: str) -> None:
 
 
 def _short(why: str) -> str:
-    """Reason without the remedy, which the page gives in full."""
+    """Sentence 'Not identifiable: …' with the reason up to its first ';', before the remedy."""
     reason = why.split(';')[0]
     return f'Not identifiable: {reason}.'
 

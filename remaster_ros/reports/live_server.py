@@ -466,11 +466,13 @@ class _Handler(RequestHandler):
         self._server.note_answer(self.request)
 
     def set_default_headers(self) -> None:
+        """Set the headers of every answer, without the name of the server."""
         self.clear_header('Server')
         for name, value in _HEADERS.items():
             self.set_header(name, value)
 
     def prepare(self) -> None:
+        """Refuse a request by another host name or from another page: HTTPError 421 or 403."""
         headers, server = self.request.headers, self._server
         hosts, origins = headers.get_list('Host'), headers.get_list('Origin')
         if len(hosts) != 1 or hosts[0].lower() not in server.hosts:
@@ -501,6 +503,7 @@ class _Plan(_Handler):
     """Page of a plan, at an address that only the view contains."""
 
     def get(self, name: str) -> None:
+        """Answer with the page of a plan, sandboxed; HTTPError 404 if it is out of date."""
         content = self._server.plan_page(name)
         if not content:
             raise HTTPError(404, reason='this plan is out of date; look at the live page')
@@ -518,6 +521,7 @@ class _Nothing(_Handler):
 
 class _WithToken(_Handler):
     def prepare(self) -> None:
+        """Refuse a request without the token, HTTPError 401; trust its connection otherwise."""
         super().prepare()
         given = self.request.headers.get_list('Authorization')
         wanted = f'Bearer {self._server.token}'
@@ -539,6 +543,11 @@ class _Scene(_WithToken):
 
 class _Command(_WithToken):
     async def post(self, name: str) -> None:
+        """Send a command to its node and answer with its outcome; a long fit counts as 'fitting'.
+
+        HTTPError: 404 unknown, 409 nothing to confirm or outdated view, 400 no view, 504 no
+        answer.
+        """
         if name not in COMMANDS:
             raise HTTPError(404, reason='there is no such command')
         command = self._server.command(name)

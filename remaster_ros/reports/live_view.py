@@ -268,7 +268,7 @@ class LiveView:
             return 0
 
     def _run(self, now_s: float) -> dict[str, Any]:
-        """State and progress of the collection."""
+        """State and progress of the collection; the state is 'silent' if the planner is."""
         done, of = self._count('configurations_done'), self._count('configurations')
         phase = self._values.get('phase', '')
         collecting = phase == 'collection' and of > 0

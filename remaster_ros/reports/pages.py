@@ -132,5 +132,5 @@ def _signed(number: float, digits: int) -> str:
 
 
 def _minus(text: str) -> str:
-    """Number with a typographic minus sign, and none for zero."""
+    """Number with typographic minus signs, and no sign for zero; ValueError if it is no number."""
     return text.removeprefix('-') if float(text) == 0.0 else text.replace('-', '−')

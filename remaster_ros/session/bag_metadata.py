@@ -56,7 +56,10 @@ class FileMetadata:
 
 
 def all_of(files: list[FileMetadata]) -> FileMetadata:
-    """Return the metadata of several files, in the order recorded, as one nameless file."""
+    """Metadata of several files, in the order recorded, as one nameless file.
+
+    Files without messages are left out; the result is empty if none has messages.
+    """
     filled = [file for file in files if file.count]
     if not filled:
         return FileMetadata('')

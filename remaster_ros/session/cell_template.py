@@ -61,7 +61,7 @@ class CellProposal:
 
 
 def rail_advice(before: Sequence[str], base_link: str) -> str:
-    """Return advice on joints that carry the whole arm, such as a rail."""
+    """Return advice to leave joints before the arm, one or more such as a rail, where they are."""
     return (
         f'{", ".join(before)} carries the whole arm, and is no joint of it here: leave it where '
         f'it is until everything is measured; the result is of the arm from {base_link} on'

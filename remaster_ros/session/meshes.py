@@ -206,5 +206,5 @@ def _collada_unit(content: bytes) -> float:
 
 
 def _line(error: Exception) -> str:
-    """Return an error as one line."""
+    """Return type and text of an error as one line of at most 200 characters."""
     return ' '.join(f'{type(error).__name__}: {error}'.split())[:200]

@@ -123,7 +123,7 @@ def split_indices(m: Measurements) -> IntArray:
 
 
 def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
-    """Yield the keys of every row; the first row is on `first_line` of its file."""
+    """Return an iterator of the keys of every row; the first row is on `first_line`."""
     lines = range(first_line, first_line + len(m))
     frame = np.full(len(m), -1) if m.frame is None else m.frame
     columns = (

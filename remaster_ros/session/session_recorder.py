@@ -343,7 +343,7 @@ class SessionRecorder:
         return not hidden
 
     def take_temperature(self, message: Any) -> None:
-        """Take a sensor_msgs/Temperature."""
+        """Record a sensor_msgs/Temperature; ignore one that is not finite."""
         if np.isfinite(message.temperature):
             self.recording.take_temperature(seconds(message.header.stamp), message.temperature)
 

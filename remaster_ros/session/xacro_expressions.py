@@ -62,7 +62,7 @@ def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
 
 
 def global_names(**functions: Any) -> dict[str, Any]:
-    """Return the names of every expression: xacro's, with keyword arguments in ``xacro``.
+    """Return name -> value for every expression: Python's, math's, `functions` in ``xacro``.
 
     The caller provides replacements of functions with side effects.
     """
@@ -85,6 +85,7 @@ class _Evaluation:
         self._names = names
 
     def of(self, node: ast.expr) -> Any:
+        """Value of an expression's node; ExpressionError if its kind is not supported."""
         visit = getattr(self, f'_of_{type(node).__name__}', None)
         if visit is None:
             raise ExpressionError(_REFUSED.get(type(node), f'{type(node).__name__} is not taken'))
@@ -98,11 +99,13 @@ class _Evaluation:
         return value
 
     def _of_Constant(self, node: ast.Constant) -> Any:
+        """Number, text or other plain constant; ExpressionError for another one."""
         if type(node.value) not in _PLAIN:
             raise ExpressionError(f'{ast.unparse(node)} is neither a number nor a text')
         return _bounded(node.value)
 
     def _of_Name(self, node: ast.Name) -> Any:
+        """Value of a name; ExpressionError if it is not defined or begins with two underscores."""
         if node.id.startswith('__'):
             raise ExpressionError(f'the name {node.id}')
         try:
@@ -111,6 +114,7 @@ class _Evaluation:
             raise ExpressionError(f"name '{node.id}' is not defined") from None
 
     def _of_Attribute(self, node: ast.Attribute) -> Any:
+        """Item of a mapping, written as an attribute; ExpressionError for any other attribute."""
         holder = self.of(node.value)
         # Loaded YAML, and properties of an included file: items, never attributes of the object.
         if node.attr.startswith('_') or not isinstance(holder, Mapping):
@@ -121,6 +125,7 @@ class _Evaluation:
             raise ExpressionError(f'{ast.unparse(node.value)} has no {node.attr}') from None
 
     def _of_Subscript(self, node: ast.Subscript) -> Any:
+        """Item or slice of a text, list, tuple or dictionary; ExpressionError for other values."""
         holder = self._data(node.value)
         if not isinstance(holder, str | list | tuple | dict):
             raise ExpressionError(f'{ast.unparse(node.value)} has no items')
@@ -130,6 +135,7 @@ class _Evaluation:
         return _item(holder, self._data(node.slice))
 
     def _of_UnaryOp(self, node: ast.UnaryOp) -> Any:
+        """Negation of a truth value, or a number with its sign; ExpressionError for others."""
         value = self._data(node.operand)
         if isinstance(node.op, ast.Not):
             return not value
@@ -138,12 +144,14 @@ class _Evaluation:
         return -value if isinstance(node.op, ast.USub) else +value
 
     def _of_BinOp(self, node: ast.BinOp) -> Any:
+        """Result of an arithmetic operator; ExpressionError for another or a huge result."""
         operate = _ARITHMETIC.get(type(node.op))
         if operate is None:
             raise ExpressionError(f'the operator in {ast.unparse(node)}')
         return _bounded(operate(self._data(node.left), self._data(node.right)))
 
     def _of_BoolOp(self, node: ast.BoolOp) -> Any:
+        """Value of the part that decides an `and` or an `or`; later parts are not evaluated."""
         ends = isinstance(node.op, ast.Or)
         value: Any = None
         for part in node.values:
@@ -153,6 +161,7 @@ class _Evaluation:
         return value
 
     def _of_Compare(self, node: ast.Compare) -> Any:
+        """Whether a chain of comparisons is true; it is evaluated up to the first false one."""
         left = self._data(node.left)
         for op, part in zip(node.ops, node.comparators, strict=True):
             right = self._data(part)
@@ -171,6 +180,7 @@ class _Evaluation:
         return tuple(self._data(part) for part in node.elts)
 
     def _of_Dict(self, node: ast.Dict) -> Any:
+        """Dictionary of evaluated keys and values; ExpressionError for `**`."""
         if None in node.keys:
             raise ExpressionError('** in a dictionary')
         return {
@@ -180,6 +190,10 @@ class _Evaluation:
         }
 
     def _of_Call(self, node: ast.Call) -> Any:
+        """Result of a call of a given function, or of a permitted method of a text.
+
+        Raises ExpressionError for another callable, `*` or `**`, or a huge result.
+        """
         if any(isinstance(part, ast.Starred) for part in node.args):
             raise ExpressionError('* in a call')
         named = {
@@ -259,6 +273,7 @@ def _power(left: Any, right: Any) -> Any:
 
 
 def _plus(left: Any, right: Any) -> Any:
+    """Sum of two numbers, or two texts or lists joined; ExpressionError for other values."""
     if isinstance(left, str | list | tuple) and isinstance(right, str | list | tuple):
         return operator.add(left, right)
     return _number(left) + _number(right)

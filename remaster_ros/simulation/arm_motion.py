@@ -109,6 +109,10 @@ class _Response:
 
     @classmethod
     def of(cls, start_s: float, reference: FloatArray, x: FloatArray, v: FloatArray) -> _Response:
+        """Response to a polynomial reference (powers, k) from positions x and speeds v.
+
+        All at `start_s`.
+        """
         steady = _steady_response(reference)
         a = x - steady[0]
         slope = steady[1] if len(steady) > 1 else np.zeros_like(x)

@@ -28,6 +28,7 @@ def causes(effect: HiddenEffect) -> list[Cause]:
 
 
 def _without_name(effect: HiddenEffect) -> Cause:
+    """Cause of an effect without a name: joints, with the one that is followed, place, driver."""
     cell = UNNAMED[effect.kind]
     joints, driver = effect.joints, cell.driver
     if 'by' in effect.detail:

@@ -187,7 +187,7 @@ def no_joint(largest: float) -> Draw:
 
 
 def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of a sensor, a form and a direction."""
+    """Draw of a sensor's effect: a form, and `size` values, `largest` times a unit vector."""
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         detail = {
@@ -200,7 +200,7 @@ def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> 
 
 
 def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of the joint with the error and of the joint that it follows."""
+    """Draw of an effect of two joints: the joint with the error, and another that it follows."""
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         joint, by = (int(j) for j in 1 + context.rng.choice(context.joints, 2, replace=False))
@@ -295,6 +295,7 @@ def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect |
 
 
 def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw 0.2 to 0.4 mrad/(N m) for one or two joints whose load varies by over 0.5 N m."""
     loaded = 1 + np.flatnonzero(np.ptp(context.circumstances.torque, axis=0) > 0.5)
     count = min(int(context.rng.choice((1, 1, 2))), len(loaded))
     joints = np.sort(context.rng.choice(loaded, count, replace=False))
@@ -303,12 +304,14 @@ def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_eccentricity(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw an eccentric encoder of any joint: waves of order 1, 2 or both, 20' in all."""
     orders = ((1,), (2,), (1, 2))[context.rng.integers(3)]
     values = 20 * ARC_MINUTE * context.direction(2 * len(orders))
     return HiddenEffect(kind, context.joint(), values, {'orders': orders})
 
 
 def _draw_gear(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a gear error of any joint: a wave of an even order from 100 to 320, 10 arc minutes."""
     # Twice the ratio of a strain wave gear of 50 to 160.
     order = int(2 * context.rng.integers(50, 161))
     values = 10 * ARC_MINUTE * context.direction(2)
@@ -316,6 +319,7 @@ def _draw_gear(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_curve(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a smooth error of any joint, RMS 8 arc minutes: orders 4 to 24, random phases."""
     orders = np.arange(4, 25)
     # Weights of a Gaussian bell: waves shorter than its width hardly occur.
     weight = np.exp(-0.5 * (orders * np.deg2rad(context.rng.uniform(4.0, 10.0))) ** 2)
@@ -327,6 +331,7 @@ def _draw_curve(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_link(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw an error of ±5 mm of a link behind joints 1 to k - 1: along it, or along an axis."""
     joint = int(context.rng.integers(1, context.joints))
     segment = context.circumstances.segments[joint]
     length = np.linalg.norm(segment)
@@ -340,6 +345,7 @@ def _draw_link(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_tilt(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a tilt by 0.01 rad of the axis of any joint but the first, about a random normal."""
     (joint,) = context.joint(2)
     across = np.cross(context.circumstances.axes[joint - 1], context.rng.standard_normal(3))
     return HiddenEffect(kind, (joint,), 0.01 * across / np.linalg.norm(across))
@@ -543,6 +549,7 @@ def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a rocking of the base by 2 mrad about a horizontal axis beyond a moment, N m."""
     angle = context.rng.uniform(0.0, np.pi)
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
     moment = np.quantile(context.circumstances.base_moment @ axis, context.rng.uniform(0.25, 0.75))

@@ -183,7 +183,10 @@ class Beam:
         return self._world.line_of_sight(self._sensor, t, self._on)
 
     def find(self, target: FloatArray, largest_rad: float, t: float) -> bool:
-        """Find the visible reflector nearest to a direction; False if none is within the angle."""
+        """Select the visible reflector nearest to a direction; False if none is near enough.
+
+        ``largest_rad``: largest angle from the direction.
+        """
         before, near = self._on, {}
         for name in self._numbers:
             self._on = name
@@ -388,6 +391,10 @@ class TrackerInstrument:
         return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
 
     def _set(self, command: Command, values: tuple[Value, ...]) -> None:
+        """Apply a setting, reply, and report the change.
+
+        It is refused during an operation, or if a value is wrong.
+        """
         setting = SETTINGS[command]
         status = Status.SERVER_BUSY if self._operation else refusal(command, values)
         if status == Status.ALL_OK:
@@ -424,6 +431,7 @@ class TrackerInstrument:
     # Commands that take time
 
     def _begin(self, command: Command, values: tuple[Value, ...]) -> None:
+        """Start a command's operation and advance it once; reply with the status if refused."""
         status = self._why_not(command, values)
         if status != Status.ALL_OK:
             self._reply(command, status)
@@ -465,6 +473,7 @@ class TrackerInstrument:
         return Status.ALL_OK
 
     def _advance(self) -> None:
+        """Advance the present operation by a step, if any; report readiness after its end."""
         if self._operation is None:
             return
         try:
@@ -474,6 +483,7 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
     def _initialize(self) -> Operation:
+        """Operation that unlocks the beam, waits, and reports the instrument initialised."""
         self._beam.locked = False
         yield from self._wait(self.behaviour.initialise_s)
         self._initialized = True
@@ -481,11 +491,13 @@ class TrackerInstrument:
         self._out.append(StatusChange(Change.INITIALIZATION))
 
     def _wait(self, seconds: float) -> Operation:
+        """Operation without effect that lasts for some seconds of the instrument's time."""
         end = self._time + seconds
         while self._time < end:
             yield
 
     def _turn(self, target: FloatArray) -> Operation:
+        """Operation that unlocks the beam and turns it to `target` (tracker's frame, m, (3,))."""
         self._beam.locked = False
         b = self.behaviour
         yield from self._wait(
@@ -518,6 +530,7 @@ class TrackerInstrument:
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
+        """Operation of a measurement: a result, or an error if beam or target is lost or moves."""
         integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
         samples = [self._beam.reflector(self._time)]
@@ -549,6 +562,7 @@ class TrackerInstrument:
         )
 
     def _lose(self) -> None:
+        """Unlock the beam; report the change of readiness unless an operation is in progress."""
         self._beam.locked = False
         if self._operation is None:
             self._out.append(self._readiness_change())
@@ -655,6 +669,7 @@ class FakeLaserTracker:
             self._send(self._instrument.break_beam())
 
     def _serve(self) -> None:
+        """Serve one client until `_closing` is set: faults, steps of the instrument, commands."""
         while not self._closing.is_set():
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
             began_s = self._world.now()
@@ -700,6 +715,10 @@ class FakeLaserTracker:
                 self._client.sendall(self._rng.bytes(64))
 
     def _accept(self) -> None:
+        """Accept a client and greet it.
+
+        A second client is refused, and any client while the fault 'off' is set.
+        """
         assert self._listener is not None
         try:
             client, _ = self._listener.accept()
@@ -722,6 +741,7 @@ class FakeLaserTracker:
         self._send(self._instrument.greeting())
 
     def _receive(self) -> None:
+        """Answer the client's received commands; drop the client if its stream is broken."""
         assert self._client is not None
         try:
             self._reader.receive_data(self._client.recv(4096))
@@ -746,6 +766,10 @@ class FakeLaserTracker:
                 self._send([ErrorReport(Command.UNKNOWN, Status.NOT_IMPLEMENTED)])
 
     def _send(self, events: Iterable[Event]) -> None:
+        """Send events to the client, if there is one.
+
+        The client is dropped if sending fails, or after a packet shortened by the fault 'cut'.
+        """
         for event in events:
             if self._client is None:
                 return
@@ -758,6 +782,7 @@ class FakeLaserTracker:
                 self._drop_client()
 
     def _drop_client(self) -> None:
+        """Close the client's connection, if there is one, and abort the instrument's operation."""
         client, self._client = self._client, None
         if client is not None:
             self._selector.unregister(client)

@@ -297,6 +297,7 @@ class OptiTrackScene:
         return self._labels.index(self._behaviour.body_id << 16 | int(number))
 
     def _plan_occlusion(self, after_s: float) -> None:
+        """Draw start and end of the next occlusion after a time, s; never if the rate is 0."""
         rate = self._behaviour.occlusions_per_s
         if rate <= 0:
             self._occlusion = (math.inf, math.inf)
@@ -462,6 +463,7 @@ class FakeOptiTrackServer:
                 self._distribute(message)
 
     def _distribute(self, frame: Frame | bytes) -> None:
+        """Send a frame or raw bytes to the group, or to each client in the client's version."""
         if self._data is not None:
             self._send(frame, self._group, self._version, self._data)
             return
@@ -509,6 +511,10 @@ class FakeOptiTrackServer:
         return [] if request.id == MessageId.KEEPALIVE else [_UNRECOGNIZED]
 
     def _welcome(self, address: Address, wanted: Version | None) -> None:
+        """Register a unicast client with the wanted bitstream or else the server's own.
+
+        Beyond `MAX_CLIENTS`, the client seen longest ago is removed. Nothing in multicast.
+        """
         if self._transport != 'unicast':
             return
         version = wanted if wanted and self._can_stream(wanted) else self._version
@@ -518,6 +524,7 @@ class FakeOptiTrackServer:
                 self._clients.pop(min(self._clients, key=lambda a: self._clients[a].last_seen_s))
 
     def _server_info(self) -> natnet.ServerInfo:
+        """Answer to CONNECT with the versions of this server, and its connection from 3.0 on."""
         group, data_port = self._group
         connection = natnet.Connection(CLOCK_HZ, data_port, self._data is not None, group)
         return natnet.ServerInfo(
@@ -546,15 +553,23 @@ class FakeOptiTrackServer:
         return natnet.Response(f'Bitstream,{version}\0'.encode())
 
     def _can_stream(self, wanted: Version) -> bool:
-        """Whether a client gets this bitstream: servers from 4.0 on send older ones on request."""
+        """Whether a client gets this bitstream on request.
+
+        Servers from 4.0 on stream any from 3.0 to their own.
+        """
         return self._version >= (4, 0) and (3, 0) <= wanted <= self._version
 
     def _version_of(self, address: Address) -> Version:
+        """Bitstream version of a client; the server's own if the client is unknown."""
         with self._lock:
             client = self._clients.get(address)
         return client.version if client is not None else self._version
 
     def _forget_silent_clients(self) -> None:
+        """Remove clients silent for `client_timeout_s`, and notify each.
+
+        None is removed with a `unicast_port`.
+        """
         if self._unicast_port is not None:
             return
         oldest = time.monotonic() - self._client_timeout_s
@@ -573,6 +588,7 @@ class FakeOptiTrackServer:
         version: Version,
         through: socket.socket | None = None,
     ) -> None:
+        """Send a message in a bitstream version, or raw bytes; network failures are ignored."""
         # A network that is down loses datagrams, as everywhere; the server goes on.
         sender = through or self._command
         assert sender is not None

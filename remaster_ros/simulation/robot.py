@@ -83,6 +83,10 @@ class FakeArm:
     def _refuse(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float, now: float
     ) -> str | None:
+        """Reason why a trajectory is refused, in a controller's words; None if it is accepted.
+
+        `start_s`: stamp of the trajectory, s, 0 for at once; `now`: present time, s.
+        """
         unknown = sorted(set(names) - set(self.names))
         missing = sorted(set(self.names) - set(names))
         if unknown or missing or len(names) != len(self.names):

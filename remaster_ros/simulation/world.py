@@ -220,6 +220,7 @@ class World:
         return not bool(self._capsules.hides(q, marker, origin))
 
     def _sensor(self, name: str) -> SimulatedSensor:
+        """Simulated sensor by name; InputError with the known names if there is none."""
         try:
             return self.truth.sensors[name]
         except KeyError:

@@ -204,6 +204,10 @@ class WorldClock:
         return {slot: (pid, done_s) for slot, (pid, done_s) in found.items() if pid}
 
     def _line(self) -> tuple[float, float, float, float]:
+        """Last written line: wall and world time of its start, limit, end of the hold, s.
+
+        Read again if a writer came in between.
+        """
         while True:
             (version,) = _VERSION.unpack_from(self._memory)
             line = _LINE.unpack_from(self._memory, _line_at(version))

@@ -73,6 +73,7 @@ class Rocking:
 
 
 def _rocks(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Text on the angle by which the base rocks, by draws, rad, (draws, 1), and on its axis."""
     return f'the base rocks by {angle(draws[:, 0])} about an axis {candidate.variant}'
 
 

@@ -38,6 +38,7 @@ def _waves(context: Context, joint: int, order: int) -> list[FloatArray]:
 
 
 def _wave(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Text on the amplitude of a joint's wave, by draws of sine and cosine, rad, (draws, 2)."""
     amplitude = np.hypot(draws[:, 0], draws[:, 1])
     (joint,) = candidate.joints
     return f'joint {joint} errs by ±{angle(amplitude)}, {candidate.variant} times a turn'

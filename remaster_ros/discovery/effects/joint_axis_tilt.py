@@ -36,6 +36,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _tilted(context: Context, joint: int, axes: list[FloatArray]) -> Design:
+    """Columns of tilts of a joint (from 1) about axes (3,) in its frame before its own move."""
     # Where the joint is before its own move: one that slides carries its frame's origin along.
     before = context.frames[:, joint - 2] @ context.chain.T_fixed[joint - 1]
     turn = before[:, :3, :3]
@@ -54,6 +55,7 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
 
 
 def _tilt(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Text on the tilt of a joint's axis, by draws, rad, (draws, 1 or 2), and on its direction."""
     size = along_mean(draws) if candidate.size > 1 else draws[:, 0]
     axes = ' and '.join(candidate.variant)
     return f'the axis of joint {candidate.joints[0]} is tilted by {angle(size)} about {axes}'

@@ -47,6 +47,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _followed(context: Context, joint: int, other: int, form: str) -> Design:
+    """Columns of a joint's error by another joint's position: linear, or its sine and cosine."""
     angle = context.measurements.q[:, other - 1]
     features = [angle] if form == 'linear' else [np.sin(angle), np.cos(angle)]
     return Design(joint - 1, np.stack(features, axis=-1))

@@ -43,6 +43,7 @@ def _tipped(context: Context, joint: int) -> Design:
 
 
 def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Text on the angle by which a joint tips under its largest lateral moment, by draws."""
     (joint,) = candidate.joints
     moment = largest(np.linalg.norm(_moment(context, joint), axis=1))
     return f'joint {joint} tips by {angle(draws[:, 0] * moment)} under {moment:.0f} N m'

@@ -56,6 +56,7 @@ def _began(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) 
 
 
 def _moved_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Text on a sensor's shift in the whole session, by draws of its speed, m/s, (draws, c)."""
     hours = float(np.ptp(context.elapsed_s)) / 3600.0
     way = along_mean(draws[:, :3]) * hours * 3600.0
     return f'{candidate.subject} moves by {length(way)} in {hours:.1f} h'

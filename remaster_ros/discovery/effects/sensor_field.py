@@ -99,6 +99,7 @@ def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
 
 
 def _field(context: Context, sensor: int, centers: FloatArray, length: float) -> Design:
+    """Columns of a sensor's field: kernels about centres (c, 3), m, along its axes; else 0."""
     mine = context.seen_by(sensor)[:, None]
     features = _kernel(context.in_sensor, centers, length) * mine
     return displaced(*along_axes(features, context.sensor_turn))

@@ -59,6 +59,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _between(context: Context, knots: FloatArray) -> FloatArray:
+    """Weights (n, knots) of values at knots: linear interpolation at each row's `progress`."""
     # Linear: the splines' own knots stand once more at both ends.
     padded = np.concatenate((knots[:1], knots, knots[-1:]))
     matrix = scipy.interpolate.BSpline.design_matrix(context.progress, padded, 1)

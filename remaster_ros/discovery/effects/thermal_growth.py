@@ -76,6 +76,7 @@ def link_vector(context: Context, link: int) -> FloatArray:
 
 
 def _has_length(context: Context, link: int) -> bool:
+    """Whether the origins of a link's two joints are more than 1 mm apart."""
     return bool(np.linalg.norm(context.chain.T_fixed[link][:3, 3]) > 1e-3)
 
 

@@ -18,6 +18,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _swung(context: Context) -> Design:
+    """Columns of the marker displaced by the tool's swing, one for each axis of the swing."""
     swing = context.motion.swing(context.markers[context.marker])
     return displaced(*(swing[:, :, axis] for axis in range(3)))
 

@@ -184,6 +184,7 @@ def _joint_angles(context: Context) -> Iterator[Candidate]:
 
 
 def _rms(values: FloatArray) -> float:
+    """Root mean square of all entries; 1 if they are all zero, as it is a divisor."""
     return float(np.sqrt(np.mean(values**2))) or 1.0
 
 
@@ -192,7 +193,7 @@ def _at(context: Context, joint: int, form: _Form) -> Design:
 
 
 def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
-    """Shift along the axes of a rotation (n, 3, 3), for each feature."""
+    """Columns of a shift along each axis of a rotation (n, 3, 3), for each feature of a form."""
     return displaced(*along_axes(form.features(context), turn(context)))
 
 
@@ -239,6 +240,10 @@ def _sagging(context: Context, marker: int) -> Design:
 
 
 def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
+    """Columns of a shift along a sensor's lines of sight, by a power of the distance, m.
+
+    Rows of other sensors are 0.
+    """
     distance = np.maximum(context.range_m, 1e-3)
     along = np.einsum('nij,nj->ni', context.sensor_turn, context.in_sensor)
     return displaced((context.seen_by(sensor) * distance ** (power - 1.0))[:, None] * along)

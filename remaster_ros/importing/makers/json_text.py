@@ -76,12 +76,17 @@ class _Decoder(json.JSONDecoder):
         return bisect_left(self._ends, at) + 1
 
     def _array(self, at: tuple[str, int], scan_once: Any, **rest: Any) -> Any:
+        """Decode an array, with the line of its begin; return it and the index behind it."""
         values, end = json.decoder.JSONArray(at, scan_once, **rest)  # type: ignore[attr-defined]
         found = records.Items(values)
         found.line = self._line(at[1] - 1)
         return found, end
 
     def _object(self, at: tuple[str, int], *args: Any, **rest: Any) -> Any:
+        """Decode an object, with the line of its begin; return it and the index behind it.
+
+        Raises InputError if a key is there twice.
+        """
         strict, scan_once, memo = args[0], args[1], args[4] if len(args) > 4 else None
         pairs, end = json.decoder.JSONObject(  # type: ignore[attr-defined]
             at, strict, scan_once, None, lambda pairs: pairs, memo

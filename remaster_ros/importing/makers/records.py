@@ -250,6 +250,7 @@ def _flat(value: Items) -> Iterator[Any]:
 
 
 def _is_scalar_number(value: Any) -> bool:
+    """Whether a value is a number or an empty entry such as null, and no list or object."""
     return not isinstance(value, (Items, Mapping)) and (
         str(value).lower() in _EMPTY or bool(NUMBER.fullmatch(str(value)))
     )

@@ -121,7 +121,7 @@ class PlanPreview(PlanConfirmation):
         T_R_N: dict[str, FloatArray],
         q: FloatArray,
     ) -> str:
-        """Write the page of the next plan; return the fingerprint of its tour."""
+        """Write the page of `tour`, planned here if None; return the fingerprint of the tour."""
         # Imported when needed: most planners draw no page.
         from remaster_ros.reports.plan_page import plan_page, write_plan_page
         from remaster_ros.reports.robot_scene import robot_scene

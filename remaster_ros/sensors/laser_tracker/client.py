@@ -289,6 +289,10 @@ class TrackerLink:
             self._one_at_a_time.release()
 
     def _reply(self, exchange: _Exchange, values: tuple[Value, ...]) -> tuple[Value, ...]:
+        """Send a command and return the values of its reply; other packets are counted.
+
+        Raises LaserTrackerError if the instrument refuses, does not answer or is not connected.
+        """
         connection = self._socket
         if connection is None or self._lost:
             raise self._lost_error(exchange.what)
@@ -335,6 +339,7 @@ class TrackerLink:
             raise self._late_error(exchange)
 
     def _late_error(self, exchange: _Exchange) -> LaserTrackerError:
+        """Close the connection, and return the error of a command without an answer."""
         self.close(f'no answer to the {exchange.what}')
         return LaserTrackerError(
             f'{self.name}: no answer to the {exchange.what} within {exchange.timeout_s:g} s, '
@@ -346,6 +351,7 @@ class TrackerLink:
         return lambda: self._now() >= end and time.monotonic() >= wall_end
 
     def _check(self, status: int, what: str) -> None:
+        """Raise LaserTrackerError with the status in words unless it is ALL_OK."""
         if status != Status.ALL_OK:
             raise LaserTrackerError(
                 f'{self.name}: {what} failed: {describe_status(status)}', status
@@ -355,6 +361,7 @@ class TrackerLink:
         return LaserTrackerError(f'{self.name}: {what} impossible: {self._lost}; connect again')
 
     def _lose(self, reason: str) -> None:
+        """Mark the connection as lost, and wake the waiting command; the first reason is kept."""
         with self._news:
             self._lost = self._lost or reason
             self._news.notify_all()
@@ -391,6 +398,10 @@ class TrackerLink:
             self._deliver(event)
 
     def _deliver(self, event: Event) -> None:
+        """Pass on a status change, or an answer to the waiting command; count other packets.
+
+        An error report without a command is kept as the possible reason of a lost connection.
+        """
         if isinstance(event, StatusChange):
             self._on_change(event.change)
         elif isinstance(event, UnknownPacket):
@@ -622,6 +633,10 @@ class LaserTrackerClient:
         return self._link.ask(command, *values, timeout_s=timeout_s, what=what)
 
     def _initialise(self) -> None:
+        """Initialise the instrument, again and again while its distance meter warms up.
+
+        Raises LaserTrackerError after `initialise_timeout_s`, or at once for another reason.
+        """
         end = self._now() + self.settings.initialise_timeout_s
         while True:
             remaining = end - self._now()
@@ -634,6 +649,10 @@ class LaserTrackerClient:
             self._sleep(_WARM_UP_RETRY_S)
 
     def _search(self, command: Command, *values: Value, what: str) -> None:
+        """Send a command that searches for the reflector, and count it; counted again if it fails.
+
+        Raises LaserTrackerError if the instrument finds none in time.
+        """
         s = self.settings
         self._link.count('searches')
         try:
@@ -662,6 +681,11 @@ class LaserTrackerClient:
         return None
 
     def _wait_until_idle(self) -> TrackerStatus:
+        """Status of the instrument once it is no longer busy.
+
+        Raises LaserTrackerError if it is busy for longer than a turn, a search and a measurement
+        take.
+        """
         s = self.settings
         end = self._now() + _SLEW_S + s.search_timeout_s + s.integration_s
         while (status := self.request_status()) is TrackerStatus.BUSY:
@@ -701,6 +725,7 @@ class LaserTrackerClient:
         self._status = status
 
     def _point(self, position: ArrayLike) -> FloatArray:
+        """Position as an array (3,); InputError if it is not three finite numbers."""
         try:
             point = np.asarray(position, float)
         except (TypeError, ValueError):

@@ -116,6 +116,7 @@ class LaserTrackerDriver(TriggeredDriver):
                 return
 
     def _search_narrowly(self) -> None:
+        """Set the instrument's search radius to `search_radius_m`, at the first call only."""
         if not self._narrow:
             self.tracker.set_search_radius(self.p.search_radius_m)
             self._narrow = True

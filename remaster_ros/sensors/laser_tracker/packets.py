@@ -372,6 +372,7 @@ def encode(event: Event) -> bytes:
 
 
 def _type_and_body(event: Event) -> tuple[int, bytes]:
+    """Type and body of an event's packet; ValueError for an event that has no packet."""
     match event:
         case Request(command, values):
             return DataType.COMMAND, _CODE.pack(command) + command.request.pack(*values)
@@ -449,6 +450,11 @@ class PacketReader:
         return UnknownPacket(type_, body)
 
     def _incomplete(self, size: int) -> Event | NeedData:
+        """`NEED_DATA` while a packet of at least `size` bytes is incomplete.
+
+        At the end of the stream: ConnectionClosed, or ProtocolError, with `broken` set, within a
+        packet.
+        """
         if not self._at_end:
             return NEED_DATA
         if not self._buffer:
@@ -460,12 +466,17 @@ class PacketReader:
 
 
 def _unpack(layout: Struct, body: bytes, what: str) -> tuple:
+    """Values of a packet's body; ProtocolError for another length. `what`: name of the packet."""
     if len(body) != layout.size:
         raise ProtocolError(f'{what} packet with {len(body)} bytes of body, not {layout.size}')
     return layout.unpack(body)
 
 
 def _decode_request(body: bytes) -> Event:
+    """Request of a packet's body; UnknownPacket for an unknown command.
+
+    Raises ProtocolError if its values do not fit the command.
+    """
     (code,) = _CODE.unpack_from(body)
     try:
         command = Command(code)
@@ -475,6 +486,10 @@ def _decode_request(body: bytes) -> Event:
 
 
 def _decode_reply(body: bytes) -> Event:
+    """Reply of a packet's body, without values if it failed; UnknownPacket for an unknown command.
+
+    Raises ProtocolError if the body is too short, or if its values do not fit the command.
+    """
     if len(body) < _COMMAND_AND_STATUS.size:
         raise ProtocolError(f'reply with {len(body)} bytes of body, not at least 8')
     code, status = _COMMAND_AND_STATUS.unpack_from(body)
@@ -491,6 +506,7 @@ def _decode_reply(body: bytes) -> Event:
 
 
 def _decode_result(body: bytes) -> Measurement:
+    """Measurement of a packet's body; ProtocolError for another length."""
     numbers: Iterator[Any] = iter(_unpack(_RESULT, body, 'measurement'))
     values: Iterator[Any] = (
         tuple(islice(numbers, 3)) if field.name in _TRIPLES else next(numbers)

@@ -79,6 +79,10 @@ class NatNetClient(MarkerFollower):
         self._due = dict.fromkeys(('connect', 'model', 'keepalive', 'bitstream'), 0.0)
 
     def _open(self) -> None:
+        """Open the command socket and, for multicast, the data socket.
+
+        Raises DeviceError if that fails; no socket stays open then.
+        """
         settings = self._settings
         self._command = open_socket(
             self._status.interface, 0, purpose='local_interface', remedy='correct local_interface'
@@ -94,6 +98,7 @@ class NatNetClient(MarkerFollower):
                 raise
 
     def _close(self) -> None:
+        """Take leave of the server, close both sockets, and drop the backlog."""
         self._send(natnet.join_datagram(MessageId.DISCONNECT))
         for opened in (self._command, self._data):
             if opened is not None:
@@ -103,6 +108,7 @@ class NatNetClient(MarkerFollower):
         self._backlog_bytes = 0
 
     def _run(self) -> None:
+        """Send due requests, receive datagrams and digest them, until `_stopping` is set."""
         with selectors.DefaultSelector() as selector:
             for opened in (self._command, self._data):
                 if opened is not None:
@@ -143,12 +149,14 @@ class NatNetClient(MarkerFollower):
         return not server.connection.is_multicast
 
     def _is_due(self, what: str, now: float, every_s: float) -> bool:
+        """Whether a kind of request is due at `now`, s; the next is due `every_s` after it."""
         if now < self._due[what]:
             return False
         self._due[what] = now + every_s
         return True
 
     def _send(self, datagram: bytes) -> None:
+        """Send a datagram to the server, unless closed; note a failure in `send_error`."""
         if self._command is None:
             return
         try:
@@ -228,6 +236,10 @@ class NatNetClient(MarkerFollower):
             self._take_answer(message)
 
     def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
+        """Hand on the samples of a frame of the believed source; ignore frames of others.
+
+        A changed bitstream has the server greeted again, a changed model requested again.
+        """
         samples = self._take_whole_frame(frame, received_s, sender)
         if sender != self._lock.source:
             return
@@ -257,6 +269,7 @@ class NatNetClient(MarkerFollower):
                 self._status.server = None
 
     def _take_server(self, server: ServerInfo) -> None:
+        """Process an answer to CONNECT: request the model, negotiate a wanted bitstream."""
         self._status.server = server
         self._lock.answer()
         self._status.port_closed = False

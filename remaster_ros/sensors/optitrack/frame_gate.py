@@ -149,6 +149,7 @@ class SourceLock:
         return tuple(candidates) if len(candidates) > 1 else ()
 
     def _candidates(self, now_s: float) -> list[Source]:
+        """Sources that could get the lock: heard lately, and never beside another holder."""
         return [
             source
             for source, other in list(self._others.items())
@@ -156,6 +157,11 @@ class SourceLock:
         ]
 
     def _note(self, source: Source, now_s: float) -> _OtherSource:
+        """Count a frame of a source without the lock, as its first one after a silence.
+
+        Beyond `REMEMBERED` sources, the one heard longest ago is removed, those never refused
+        first.
+        """
         known = self._others.get(source)
         patience_s = REFUSED_FOR_S if known is not None and known.simultaneous else self._silence_s
         if known is None or now_s - known.last_s > patience_s:
@@ -414,6 +420,10 @@ class MarkerGate:
         return found[0]
 
     def _jump(self, reading: MarkerSample) -> Dropped | None:
+        """`Dropped.JUMP` if the marker is farther from the last reading than its speed allows.
+
+        None if it is not, or if there is no last reading.
+        """
         last = self._last_reading
         if last is None:
             return None
@@ -431,6 +441,7 @@ class MarkerGate:
         return None
 
     def _frozen(self, reading: MarkerSample) -> Dropped | None:
+        """`Dropped.FROZEN` from the repeat `FROZEN_FRAMES` of the last position on, else None."""
         last = self._last_reading
         same = last is not None and np.array_equal(reading.position, last.position)
         self._repeats = self._repeats + 1 if same else 0
@@ -445,6 +456,10 @@ def _implausible(reading: MarkerSample) -> Dropped | None:
 def _sample(
     frame: Frame, marker: LabeledMarker, received_s: float, ticks_per_s: int
 ) -> MarkerSample:
+    """Sample of a marker in a frame, its age since exposure or arrival at the server, s.
+
+    The age is the server's estimate if it has no clock, and 0 if it sent no times.
+    """
     age_s = max(frame.software_latency, 0.0)
     if ticks_per_s:
         # USB cameras have no clock and send no exposure time.

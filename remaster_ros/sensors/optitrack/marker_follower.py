@@ -112,6 +112,7 @@ def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
 
 
 def _unanswered(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
+    """Diagnosis of a server that did not answer: interface, port or address, with the remedy."""
     where = f'{settings.server}:{settings.command_port}'
     if status.send_error:
         return Diagnosis(
@@ -202,6 +203,7 @@ def _foreign(status: StreamStatus) -> str:
 
 
 def _contest(status: StreamStatus) -> str:
+    """Text on several sources that send frames, of which none is believed, with the remedy."""
     return (
         f'frames come from {" and ".join(status.contestants)} at the same time, and none is '
         f'believed, as nothing tells which of them Motive sends: stop the other program'
@@ -209,6 +211,7 @@ def _contest(status: StreamStatus) -> str:
 
 
 def _refused(status: StreamStatus) -> str:
+    """Text on frames that come from refused sources only, with the remedy."""
     return (
         f'frames come only from {", ".join(status.rivals)}, which sent beside the believed source '
         f'and is refused: stop it; if it is Motive, restart its streaming'
@@ -454,6 +457,7 @@ class MarkerFollower(ABC):
             _log.info('OptiTrack: frames of %s are believed', describe(source))
 
     def _hand_on(self, sample: MarkerSample) -> None:
+        """Pass a sample to `_on_sample`, and note the time; log an exception of the callback."""
         self._sample_at = time.monotonic()
         try:
             self._on_sample(sample)

@@ -229,6 +229,7 @@ class _Text(Codec):
         reader.text()
 
     def write(self, item: str) -> bytes:
+        """Bytes of a text, UTF-8 with final NUL; ValueError for a NUL or over 255 bytes."""
         data = item.encode('utf-8')
         if b'\0' in data or len(data) >= MAX_TEXT_BYTES:
             raise ValueError(
@@ -261,7 +262,7 @@ class Record(Codec):
         self.least = sum(part.least for part in parts)
 
     def read(self, reader: Reader) -> Any:
-        """Read the items in their order."""
+        """Read the items in their order; return the record that `_build` makes of the items."""
         return self._build(*[part.read(reader) for part in self._parts])
 
     def skip(self, reader: Reader) -> None:
@@ -335,6 +336,7 @@ class SizedList(List):
     least = _COUNT_AND_SIZE.size
 
     def _head(self, reader: Reader) -> tuple[int, int]:
+        """Number of items and their size in bytes; ProtocolError if these cannot be."""
         count, size = reader.unpack(_COUNT_AND_SIZE)
         if count < 0 or not count * self.kind.least <= size <= reader.remaining_bytes:
             raise ProtocolError(
@@ -551,6 +553,7 @@ def _flat_body_3(body: RigidBody) -> tuple:
 
 
 def _parts_of_body_2(body: RigidBody) -> tuple:
+    """Items of a rigid body of NatNet 2: id and pose, columns of markers, error and parameters."""
     columns = tuple(zip(*body.markers)) or ((), (), ())
     head = body.id, *body.position, *body.orientation_xyzw
     return head, columns, (body.mean_error, body.params)
@@ -667,6 +670,7 @@ def _read(reader: Reader, version: Version) -> Description:
 
 
 def _write(description: Description, version: Version) -> bytes:
+    """Bytes of a description in one bitstream version; ValueError if only its name was kept."""
     kind = _KINDS.get(type(description))
     if kind is None:
         raise ValueError(f'only the name of {description.name!r} is kept: it cannot be encoded')
@@ -987,6 +991,7 @@ def format_version(version: Version) -> str:
 
 
 def _known(version: Version | None) -> Version:
+    """Return the bitstream version; ProtocolError if it is None."""
     if version is None:
         raise ProtocolError('the bitstream version is not known yet')
     return version
@@ -1005,6 +1010,7 @@ def _wanted_version(payload: bytes) -> Version | None:
 
 
 def _decode_server_info(payload: bytes) -> ServerInfo:
+    """Decode the answer to CONNECT; its connection is None before NatNet 3.0."""
     reader = Reader(payload)
     name, *versions = reader.unpack(_SENDER)
     app_version, natnet_version = tuple(versions[:4]), (versions[4], versions[5])
@@ -1016,6 +1022,7 @@ def _decode_server_info(payload: bytes) -> ServerInfo:
 
 
 def _encode_server_info(info: ServerInfo) -> bytes:
+    """Encode an answer to CONNECT; ValueError if one of 3.0 or later lacks its connection."""
     name = info.name.encode()[:255]
     payload = _SENDER.pack(name, *info.app_version, *info.natnet_version, 0, 0)
     if info.natnet_version < (3, 0):

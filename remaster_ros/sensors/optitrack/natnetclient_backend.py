@@ -76,6 +76,7 @@ class NatNetClientBackend(MarkerFollower):
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:
+        """Check that the server's address and data port can be bound here; else DeviceError."""
         # natnetclient binds the server's own address; this check fails before it opens sockets.
         open_socket(
             self._status.server_ip,
@@ -235,6 +236,7 @@ def _read(client: Any, datagram: bytes) -> tuple[LabeledMarker, ...] | None:
 
 
 def _close_sockets(client: Any) -> None:
+    """Close both sockets of natnetclient's client; missing sockets and errors are ignored."""
     for name in ('comm_sock', 'data_sock'):
         with contextlib.suppress(AttributeError, OSError):
             getattr(client, name)._sock.close()

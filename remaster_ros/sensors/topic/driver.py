@@ -37,6 +37,10 @@ class Sighting(NamedTuple):
 
 
 def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
+    """Sighting of a message; its position is None if `place` is None, not finite or the origin.
+
+    `place`, `turn`: fields of the message with position and orientation.
+    """
     stamp = message.header.stamp
     position = None
     if place is not None:
@@ -52,6 +56,7 @@ def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
 
 
 def _marker(message: Any, marker: str) -> Any:
+    """Translation of the marker of a name or number; None if the message does not have it."""
     for entry in message.markers:
         if marker in (entry.marker_name, str(entry.marker_index)):
             return entry.translation
@@ -170,6 +175,7 @@ class TopicDriver(StreamDriver):
         """Do nothing: the subscription is the node's."""
 
     def _unpublished(self) -> str:
+        """Reason why the topic has no message of the expected type; '' if a node sends it."""
         found = self._publishers()
         if any(kind == self._type for _, kind in found):
             return ''
