@@ -213,7 +213,7 @@ class StoppingRule:
         return f'about {look.more} more configurations to fit{time}{planned}'
 
     def _structure(self, found: Estimate, count: int) -> tuple[StructureTest, ...]:
-        """Significant structure in the residuals, by p-value; () if no test is due."""
+        """Significant tests of structure, by p-value; () if none is significant or due."""
         limit = self.limit(count)
         if limit == 0.0:
             return ()

@@ -472,7 +472,10 @@ class _Handler(RequestHandler):
             self.set_header(name, value)
 
     def prepare(self) -> None:
-        """Refuse a request by another host name or from another page: HTTPError 421 or 403."""
+        """Refuse a request by another host name (HTTPError 421) or from another page (403).
+
+        A command without the header Origin is refused as well (403).
+        """
         headers, server = self.request.headers, self._server
         hosts, origins = headers.get_list('Host'), headers.get_list('Origin')
         if len(hosts) != 1 or hosts[0].lower() not in server.hosts:

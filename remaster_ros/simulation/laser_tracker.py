@@ -530,7 +530,7 @@ class TrackerInstrument:
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
-        """Operation of a measurement: a result, or an error if beam or target is lost or moves."""
+        """Measurement as an operation: a result, or an error if beam breaks or target moves."""
         integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
         samples = [self._beam.reflector(self._time)]

@@ -236,7 +236,7 @@ class NatNetClient(MarkerFollower):
             self._take_answer(message)
 
     def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
-        """Hand on the samples of a frame of the believed source; ignore frames of others.
+        """Hand on the samples of a frame of the believed source; a frame of another has none.
 
         A changed bitstream has the server greeted again, a changed model requested again.
         """

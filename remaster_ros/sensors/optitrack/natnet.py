@@ -336,7 +336,10 @@ class SizedList(List):
     least = _COUNT_AND_SIZE.size
 
     def _head(self, reader: Reader) -> tuple[int, int]:
-        """Number of items and their size in bytes; ProtocolError if these cannot be."""
+        """Number of items and their size in bytes; ProtocolError if the rest is too short.
+
+        Also raised if the size is below that of so many of the smallest items.
+        """
         count, size = reader.unpack(_COUNT_AND_SIZE)
         if count < 0 or not count * self.kind.least <= size <= reader.remaining_bytes:
             raise ProtocolError(
