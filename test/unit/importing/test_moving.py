@@ -99,7 +99,9 @@ def test_a_session_is_written_and_read_to_the_last_digit(session, tmp_path):
         read_session(tmp_path / 't')
 
 
-@pytest.mark.parametrize('clock_s', [-0.7, 0.02, 1.9])
+@pytest.mark.parametrize(
+    'clock_s', [0.02, *(pytest.param(c, marks=pytest.mark.qualify) for c in (-0.7, 1.9))]
+)
 def test_the_offset_of_the_clocks_is_found(clock_s):
     world, recording = recorded(3, seconds=12.0, dynamics=without_dynamics(Dynamics(clock_s=0.0)))
     moved = replace(recording, frame_stamps=recording.frame_stamps - clock_s)
@@ -205,6 +207,7 @@ def test_markers_of_one_message_are_of_one_sensor(recording, monkeypatch):
     assert streams[0].marker == 'ball_1'
 
 
+@pytest.mark.qualify
 def test_moving_frames_agree_with_the_standstills_between_them(tmp_path, capsys):
     print('moving world, seed 5002')
     recording = recorded(5002, seconds=7.0, stops=True, joints_hz=125.0, camera_hz=60.0)
