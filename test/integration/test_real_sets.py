@@ -99,7 +99,8 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4, atol=1e-18)
     # A URDF holds lengths and tilts: those beside its soft base would leave 1.16 mm.
     left = form_content(file, 'urdf', np.random.default_rng(0))
-    assert left.rms_mm < 0.9
+    # Bearings that tip, which no such form holds, are most of it.
+    assert left.rms_mm < 1.0
     assert 'export that one' in left.better_file
     loadable = json.loads((tmp_path / 'discovery.json').read_text())['loadable']
     offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
