@@ -95,7 +95,7 @@ def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
 
 
 def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
-    """Prior of a sensor's registration T_R_N."""
+    """Prior of a sensor's registration T_R_N: six residuals in standard deviations."""
     known = matrix_from_quaternion_xyzw(prior.rotation_xyzw)
     widths = max(prior.std_m, TIGHTEST_PRIOR), max(prior.std_rad, TIGHTEST_PRIOR)
 

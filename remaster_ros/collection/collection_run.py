@@ -115,7 +115,7 @@ class CollectionRun:
         return ''
 
     def collect(self, new_token: str) -> None:
-        """Begin a run with this token, or go on with that under way; clears `left` and `why`."""
+        """Run, with this token unless the run is running already; clears `left` and `why`."""
         self.left = ''
         if self.state != 'running':
             self.token = new_token

@@ -221,7 +221,7 @@ class Pairing:
         absent: Collection[str] = (),
         message_counts: Mapping[str, int] | None = None,
     ) -> None:
-        """Reject every sensor whose time is over at `now_s`.
+        """Decide on every sensor whose time is over at `now_s`: by its readings, else reject it.
 
         A cut cable shows only when the heartbeat is over, and simulated time may run faster: a
         required sensor is not rejected before another message of its node has come; if the node

@@ -315,7 +315,7 @@ class ReferenceWatch:
         return self.change
 
     def _displacement(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
-        """Measured minus nominal marker position in R, m, (3,), without the arm's own part."""
+        """Measured minus nominal marker position at the reading's joints, in R, m, (3,)."""
         nominal = self._chain.positions(row.q, self._markers[row.marker])
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 

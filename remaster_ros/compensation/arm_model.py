@@ -370,7 +370,7 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters whose covariance is known, in order."""
+        """Names of all parameters, in the order of the covariance."""
         joints = self.chain.joint_names
         origins = (*joints, 'tool')
         names = [f'joint_offset.{joint}' for joint in joints]

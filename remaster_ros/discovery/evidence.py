@@ -353,7 +353,7 @@ class System:
         return value
 
     def _implausible(self, beta: FloatArray) -> float:
-        """Return the squared parameters in units of their priors, the smoothness not counted."""
+        """Return beta' P beta of all parameters, P their prior precision without smoothness."""
         base = beta[: self.p]
         return float(self.ridge @ beta**2 + base @ self.base_precision @ base)
 

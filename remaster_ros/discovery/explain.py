@@ -374,7 +374,7 @@ class SearchRecord:
 
     @classmethod
     def of(cls, walk: Walk, named: Sequence[tuple[Candidate, ...]]) -> SearchRecord:
-        """Return the record of a walk in which these causes are named."""
+        """Return the record of a walk, with the likelier causes that are not among `named`."""
         taken = {at_any_time(candidate) for group in named for candidate in group}
         candidates = {
             identity(candidate): candidate

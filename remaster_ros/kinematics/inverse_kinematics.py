@@ -268,7 +268,7 @@ class InverseKinematics:
         )
 
     def missed_solutions(self) -> MissedSolutions:
-        """Run the trial of many starts at evenly spread poses, and return its counts."""
+        """Counts of solutions that many starts found at evenly spread poses, and how often each."""
         seeds = spread(self.chain, range(len(self.chain)), TRIAL_POSES)
         counts = []
         for q in seeds:

@@ -200,7 +200,10 @@ class JointReports:
         return '', ''
 
     def _learn(self, report: JointReport) -> None:
-        """Update the usual delay of reports: at once to a smaller one, slowly to a larger one."""
+        """Update the usual delay of reports: the least of the first `LEARN`, then that of each.
+
+        It follows by at most `SHORTEN` down and `DRIFT` up, s a second.
+        """
         delay = report.clock_s - report.stamp_s
         if self._delay is None:
             self._delays.append((report.wall_s, delay))

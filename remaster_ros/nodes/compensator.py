@@ -401,6 +401,7 @@ class CompensatorNode(RemasterNode):
 
     @property
     def _warm(self) -> float | None:
+        """Temperature to correct with, °C; None if the correction does not need it."""
         return self._temperature_c if self._correction.compensator.model.grows else None
 
     def _on_joint_state(self, message: JointState, info: Any) -> None:

@@ -75,11 +75,11 @@ def transform_array(message: TransformStamped) -> FloatArray:
 
 
 def message_class(type_name: str) -> Any:
-    """Return the class of a type, as ``sensor_msgs/msg/JointState``; `InputError` for none."""
+    """Class of a message type such as ``sensor_msgs/msg/JointState``; InputError if there is none."""
     package, _, name = type_name.partition('/msg/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
-    except (ImportError, AttributeError):
+    except (ImportError, AttributeError, TypeError, ValueError):
         raise InputError(f'this machine has no message type {type_name}') from None
 
 

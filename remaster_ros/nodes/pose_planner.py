@@ -296,7 +296,7 @@ class PosePlanner(RemasterNode):
             self._joint_states = None
 
     def _on_settled(self, message: JointState) -> None:
-        """Set the arm's configuration."""
+        """Set the arm's configuration; `run.why` tells what is wrong with a message."""
         try:
             # The nominal joint angles of the tool's pose, if the bridge corrects.
             wanted = wanted_of(message, self._order.names)

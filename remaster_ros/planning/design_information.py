@@ -205,7 +205,7 @@ class DesignInformation:
         return poses, members
 
     def total(self, chosen: Sequence[int]) -> FloatArray:
-        """Return the information of chosen configurations with the priors, (f, f)."""
+        """Information of chosen configurations and priors, (f, f), less what poses share."""
         which = np.array(chosen, dtype=np.int64)
         sums, count = self._sums(chosen)
         visited = np.flatnonzero(count)

@@ -616,7 +616,10 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 
 
 def causes(discovery: Discovery) -> Figure:
-    """Draw each cause: residuals without it against its driver, and the fit with its band."""
+    """Draw each cause of a joint, or of a moment: residuals without it, and the fit with its band.
+
+    The sizes of all other causes stand in one panel.
+    """
     panels = [
         candidate
         for group in discovery.groups

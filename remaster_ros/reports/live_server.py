@@ -360,7 +360,7 @@ class LiveServer:
         self._loop.call_soon_threadsafe(self._show, content, str(view['seen']), plan)
 
     def _show(self, content: bytes, seen: str, plan: str) -> None:
-        """Replace the view; runs in the server's thread."""
+        """Replace page and plan, note number and time of the view; in the server's thread."""
         self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
         self._view, self._seen, self._plan = content, seen, plan
 

@@ -257,6 +257,7 @@ def _is_scalar_number(value: Any) -> bool:
 
 
 def _is_name(value: Any) -> bool:
+    """Whether a value is neither a list, nor a mapping, nor the text of a number."""
     return not isinstance(value, (Items, Mapping)) and not NUMBER.fullmatch(str(value))
 
 
