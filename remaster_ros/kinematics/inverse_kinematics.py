@@ -268,7 +268,7 @@ class InverseKinematics:
         )
 
     def missed_solutions(self) -> MissedSolutions:
-        """Counts of solutions that many starts found at evenly spread poses, and how often each."""
+        """Counts of solutions that many starts found at evenly spread poses, and how often."""
         seeds = spread(self.chain, range(len(self.chain)), TRIAL_POSES)
         counts = []
         for q in seeds:

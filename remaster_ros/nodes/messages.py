@@ -75,7 +75,7 @@ def transform_array(message: TransformStamped) -> FloatArray:
 
 
 def message_class(type_name: str) -> Any:
-    """Class of a message type such as ``sensor_msgs/msg/JointState``; InputError if there is none."""
+    """Class of a message type, as ``sensor_msgs/msg/JointState``; InputError if there is none."""
     package, _, name = type_name.partition('/msg/')
     try:
         return getattr(importlib.import_module(f'{package}.msg'), name)
