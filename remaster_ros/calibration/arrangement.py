@@ -126,7 +126,7 @@ class Arrangement:
         return turned * np.array(self.signs) + _QUARTER * np.array(self.quarters)
 
     def rates(self, columns: FloatArray | None, scale: float = 1.0) -> FloatArray | None:
-        """Return what has a sign and no zero, (n, k), times a scale; None for None."""
+        """Joint speeds or torques of the robot, (n, k), times a scale; None without columns."""
         if columns is None:
             return None
         return scale * columns[:, list(self.order)] * np.array(self.signs)

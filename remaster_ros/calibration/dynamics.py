@@ -341,6 +341,6 @@ def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
 
 
 def late_words(late_s: float, std_s: float) -> str:
-    """Return how late stamps are with the standard deviation, as text."""
+    """Delay of stamps and its standard deviation as text: '9.97 ± 0.12 ms late' or '… early'."""
     what = 'late' if late_s >= 0.0 else 'early'
     return f'{1e3 * abs(late_s):.2f} ± {1e3 * std_s:.2f} ms {what}'

@@ -577,7 +577,7 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
 
 
 def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
-    """Return the same summary for --json."""
+    """Summary of an import for --json: session, columns, warnings, fit and rows far off."""
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,

@@ -393,7 +393,7 @@ def _judged(
     for left in _left_by_moment(every, solution):
         try:
             off = find_outliers(
-                every.rows, partial(_as_it_is, left), left, found.problem.sensor_names
+                every.rows, partial(_residuals_as_given, left), left, found.problem.sensor_names
             ).gross
         except InsufficientDataError:
             if gross is None:
@@ -409,7 +409,7 @@ def _judged(
     return residuals.only(kept)
 
 
-def _as_it_is(left: FloatArray, kept: BoolArray) -> FloatArray:
+def _residuals_as_given(left: FloatArray, kept: BoolArray) -> FloatArray:
     """Return residuals of a model that is not fitted again, whichever rows are kept."""
     return left
 

@@ -387,12 +387,16 @@ class Walk:
                 progress(0.5 * (index + 1))
         changed = self._with_changes(changes) if start is None else []
         if self._refined() or changed:
-            first = max([*(one.best for one in self.chains), *changed], key=lambda one: one.value)
+            first = max([self._best_found, *changed], key=lambda one: one.value)
             self.chains.append(self._chain(first, hot=False))
         if changed and self._refined():
-            best = max((chain.best for chain in self.chains), key=lambda one: one.value)
-            self.chains.append(self._chain(best, hot=False))
+            self.chains.append(self._chain(self._best_found, hot=False))
         self._weigh()
+
+    @property
+    def _best_found(self) -> Evaluated:
+        """Best model of all chains so far."""
+        return max((chain.best for chain in self.chains), key=lambda one: one.value)
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
         """Add likely changes to the pool; return best models with the most likely change.
@@ -435,7 +439,7 @@ class Walk:
 
         At other moments, and of what has a place that no parameter is.
         """
-        best = max((chain.best for chain in self.chains), key=lambda one: one.value)
+        best = self._best_found
         context, tried = self.data.part, [block.candidate for block in self.pool.blocks]
         added = False
         for position, (block, _) in enumerate(best.model):
@@ -567,13 +571,13 @@ class Walk:
             walker = Walker(State.of(surface, current.model), self.rng)
             self._run(walker, hot)
             best = max(walker.seen, key=lambda model: walker.seen[model])
-            found = self._settled(best, current, anew)
+            found = self._refitted(best, current, anew)
             if current is not self.bare and found.value < current.value + SETTLED:
                 if anew:
                     break
                 # Kinds that were not shown beside other blocks may be now.
                 anew = True
-                found = self._settled(current.model, current, anew)
+                found = self._refitted(current.model, current, anew)
                 if found.value < current.value + SETTLED:
                     break
             current, hot = found, False
@@ -603,7 +607,7 @@ class Walk:
             self._wholes[model] = max(tried, key=lambda one: one.value, default=None)
         return self._wholes[model]
 
-    def _settled(self, model: Model, before: Evaluated, anew: bool) -> Evaluated:
+    def _refitted(self, model: Model, before: Evaluated, anew: bool) -> Evaluated:
         """Return a model at its own noise, with members that stand out added as blocks.
 
         ``before`` if the model cannot be fitted; ``anew``: choose the background anew.
@@ -656,7 +660,7 @@ class Walk:
                 again = evaluated(self.pool, chain.best.families, chain.best.model, chain.best)
                 self._known[chain.best.model] = again
         pooled |= {model: one.value for model, one in self._known.items() if one is not None}
-        start = max((chain.best for chain in self.chains), key=lambda one: one.value)
+        start = self._best_found
         for model, value in self._exchanges(start).items():
             pooled[model] = max(value, pooled.get(model, -np.inf))
         order = sorted(pooled, key=lambda model: -pooled[model])[:MOST_MODELS]

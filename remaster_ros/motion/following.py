@@ -206,7 +206,7 @@ class Following:
         return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
 
     def _look(self, seen: Seen, elapsed: float) -> str:
-        """Return how the arm is off its path, or '' if it follows; keep its lag."""
+        """Deviation of the arm from its path in words, '' if it follows; the lag is kept."""
         if not self.reacted:
             still = self._is_still_at_start(seen)
             if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
@@ -291,7 +291,7 @@ class Following:
 
 
 def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:
-    """Return how far joints may be off their planned position at a time, rad or m, (k,).
+    """Largest deviation of joints from their planned position that is allowed, rad or m, (k,).
 
     ON_PATH_RAD beside the path, and allowed lag times speed behind it, as in `Following`; for a
     controller that watches its path itself.

@@ -77,7 +77,7 @@ class Curve:
         return cls(knots, start, closed, found.visited, weights)
 
     def among(self, values: FloatArray) -> Curve:
-        """Return the same curve with other visited values, (n,)."""
+        """Curve with these values of the driver as visited, (n,)."""
         return replace(self, visited=np.unique(self.in_turn(values)))
 
     @property
