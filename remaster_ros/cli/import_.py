@@ -302,6 +302,12 @@ def run(args: argparse.Namespace) -> int:
     Raises InputError if files or options are invalid, InsufficientDataError if the data do not
     fit the robot (unless --unchecked).
     """
+    if args.moving and (len(args.files) > 1 or not is_bag(args.files[0])):
+        own = args.files[-1] / 'bag'
+        raise InputError(
+            f'{args.files[-1]}: --moving takes one bag, with joint states and frames as recorded'
+            + (f'; that of this session is {own}' if is_bag(own) else '')
+        )
     if len(args.files) == 1 and (args.files[0] / HEADER).exists():
         return _mend(args)
     if args.urdf is None and args.cell is None:
@@ -420,10 +426,6 @@ def _import_moving(
     args: argparse.Namespace, cell: Workcell | None, urdf: str, chain: SerialChain
 ) -> int:
     """Write the session of a bag whose arm moved; errors as of `run`."""
-    if len(args.files) > 1 or not is_bag(args.files[0]):
-        raise InputError(
-            f'{args.files[-1]}: --moving takes one bag, with joint states and frames as recorded'
-        )
     for option, given in (
         ('--couple', args.couple),
         ('--reverse', args.reverse),

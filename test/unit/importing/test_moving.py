@@ -251,3 +251,11 @@ def test_what_cannot_be_measured_in_motion_is_refused(recording, tmp_path, capsy
     command = ['import', '--moving', str(tmp_path / 'table.csv'), '--cell', 'demo']
     assert main([*command, '--out', str(tmp_path / 's')]) == 2
     assert '--moving takes one bag' in capsys.readouterr().err
+    # A session is no bag: it is not written again as it is.
+    session = tmp_path / 'session'
+    (session / 'bag').mkdir(parents=True)
+    (session / 'session.yaml').write_text('format: remaster-session/1\n', encoding='utf-8')
+    (session / 'bag' / 'metadata.yaml').write_text('', encoding='utf-8')
+    command = ['import', '--moving', str(session), '--cell', 'demo', '--out', str(tmp_path / 's')]
+    assert main(command) == 2
+    assert f'that of this session is {session / "bag"}' in capsys.readouterr().err
