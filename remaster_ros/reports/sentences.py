@@ -336,6 +336,9 @@ FEW_HELD_OUT = 'by chance, as so few poses were held out'
 # If a cause could move the marker by more than this share of the noise without being found, the
 # verdict "none" proves nothing.
 MOST_UNSEEN = 0.5
+# Estimated noise over what is left from which on the estimate is no measure of the noise: by a dozen
+# independent readings, as of an arm that moved for a minute, it is uncertain by a fifth.
+NOT_ABOVE = 1.2
 # Size in standard deviations from which on a cause is found.
 DETECTED = 4.5
 
@@ -543,8 +546,12 @@ def _held_out(gain: Gain) -> str:
     before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     if before is None or after is None or gain.held_out_rms_after_m is None:
         return ''
-    words = f'{1e3 * before:.3f} mm RMS before, {1e3 * after:.3f} mm after; the noise alone is '
-    words += f'{1e3 * gain.noise_floor_m:.3f} mm'
+    words = f'{1e3 * before:.3f} mm RMS before, {1e3 * after:.3f} mm after; '
+    noise = f'{1e3 * gain.noise_floor_m:.3f} mm'
+    if gain.noise_floor_m > NOT_ABOVE * after:
+        words += f'the noise is hardly known: {noise} as estimated'
+    else:
+        words += f'the noise alone is {noise}'
     if gain.held_out_gross:
         words += (
             f'; {not_counted(gain.held_out_gross)} '

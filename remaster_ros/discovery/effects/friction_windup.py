@@ -22,8 +22,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _wound(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    joint = candidate.joints[0]
-    return f'joint {joint} is {of_joint(context, joint, 2.0 * draws[:, 0])} apart, way by way'
+    """Phrase for the difference of a joint between its two directions of motion."""
+    (joint,) = candidate.joints
+    apart = of_joint(context, joint, 2.0 * draws[:, 0])
+    return f'joint {joint} differs by {apart} between its two directions'
 
 
 EFFECT = Effect(
@@ -35,7 +37,8 @@ EFFECT = Effect(
     source='Dahl 1968, Aerospace Corp. TOR-0158; Taghirad & Bélanger 1998 (harmonic drives)',
     unit='rad',
     plausible=(1e-6, 5e-4),
-    sentence='Friction winds {subject} up: where it is depends on which way it moves.',
+    sentence='Friction winds up the gears of {subject}: the direction of motion changes the true '
+    'angle.',
     separate_by='the same path there and back',
     remedy='Have the friction of the gearbox checked (grease, preload); where it must be exact, '
     'come from the same side.',
