@@ -336,7 +336,7 @@ FEW_HELD_OUT = 'by chance, as so few poses were held out'
 # If a cause could move the marker by more than this share of the noise without being found, the
 # verdict "none" proves nothing.
 MOST_UNSEEN = 0.5
-# Estimated noise over what is left from which on the estimate is no measure of the noise: by a dozen
+# Estimated noise over what is left from which on it is no measure of the noise: by a dozen
 # independent readings, as of an arm that moved for a minute, it is uncertain by a fifth.
 NOT_ABOVE = 1.2
 # Size in standard deviations from which on a cause is found.
