@@ -461,6 +461,7 @@ def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatA
 
 
 _OF_MEASUREMENT = 'it is an error of the measurement and not of the arm'
+_OF_GUIDE = 'compensation.json has no term for a carriage that leaves its way or turns along it'
 _NOT_TOLD = (
     'it depends on what no controller is told (time, the last move, what happened once, on which '
     'side the base lies)'
@@ -471,22 +472,20 @@ def _not_corrected(
     candidates: Sequence[tuple[Candidate, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
     """Yield the effects that are not corrected, one for the candidates of the same joints."""
-    by_effect: dict[tuple[str, tuple[int, ...], bool], FloatArray] = {}
+    by_effect: dict[tuple[str, tuple[int, ...], str], FloatArray] = {}
     remedies = {}
     for candidate, where in candidates:
-        key = (
-            candidate.name,
-            candidate.joints,
-            candidate.of_measurement or candidate.place == 'marker',
-        )
+        of_measurement = candidate.of_measurement or candidate.place == 'marker'
+        along_a_guide = candidate.driver == 'own_place' and candidate.place != 'joint_angle'
+        why = _OF_MEASUREMENT if of_measurement else _OF_GUIDE if along_a_guide else _NOT_TOLD
+        key = candidate.name, candidate.joints, why
         displacement = data.columns([candidate]) @ theta[where]
         by_effect[key] = by_effect[key] + displacement if key in by_effect else displacement
         remedies[key] = EFFECTS[candidate.name].remedy_of(candidate)
-    for (name, joints, of_measurement), displacement in by_effect.items():
+    for (name, joints, why), displacement in by_effect.items():
         size = float(np.sqrt(np.mean(np.sum(displacement**2, axis=-1))))
         if round(1e3 * size, 3) == 0.0:
             # It shows as nothing wherever it is listed.
             continue
-        why = _OF_MEASUREMENT if of_measurement else _NOT_TOLD
         reported = EFFECTS[name].reported_as or name
-        yield NotCorrected(reported, joints, size, why, remedies[name, joints, of_measurement])
+        yield NotCorrected(reported, joints, size, why, remedies[name, joints, why])

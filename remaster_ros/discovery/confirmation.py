@@ -33,7 +33,7 @@ from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Candidate, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.drivers import Driver, driver_named
-from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.registry import effects_of
 from remaster_ros.discovery.effects.splines import Curve, in_turn, start_of_turn
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.gain import rms
@@ -600,7 +600,7 @@ def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, lis
     """
     others = [
         candidate
-        for effect in EFFECTS.values()
+        for effect in effects_of(data.context).values()
         if not effect.moves_the_fit and not effect.needs(data.context)
         for candidate in effect.candidates(data.context)
     ]

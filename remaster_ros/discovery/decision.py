@@ -16,7 +16,7 @@ from scipy.special import ndtri_exp
 
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.base import Candidate
-from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.walk import NEEDED
 from remaster_ros.discovery.words import called
@@ -174,7 +174,7 @@ def _candidates(found: Discovery) -> list[Candidate]:
     context = found.residuals.context
     return [
         candidate
-        for effect in EFFECTS.values()
+        for effect in effects_of(context).values()
         if not effect.needs(context) and not effect.moves_the_fit and not effect.costly
         for candidate in effect.candidates(context)
     ]

@@ -191,7 +191,7 @@ def discover_session(
     else:
         before = sound_estimate(session, fitted=partial(estimate_beside, moving))
     found, residuals, pool = _to_search(session, before, rng)
-    effects_tried = effects_of(session.is_moving)
+    effects_tried = effects_of(residuals.context)
     untestable = {
         name: why
         for name, effect in effects_tried.items()

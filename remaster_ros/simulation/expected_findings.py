@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from remaster_ros.simulation.hidden_effects import KINDS, NAMED, UNNAMED, HiddenEffect
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, HiddenEffect
 
 Cause = tuple[str, tuple[int, ...], str]
 """Name, joints, and further: place and driver of an effect without a name, or a sensor's name."""
@@ -22,14 +22,14 @@ def causes(effect: HiddenEffect) -> list[Cause]:
         return [(effect.kind, (joint,), '') for joint in effect.joints]
     if effect.kind == 'joint_coupling':
         return [(effect.kind, (effect.joints[0], effect.detail['by']), '')]
-    if effect.kind in UNNAMED:
+    if effect.kind not in NAMED:
         return [_without_name(effect)]
     return [(effect.kind, effect.joints, effect.detail.get('sensor', ''))]
 
 
 def _without_name(effect: HiddenEffect) -> Cause:
     """Cause of an effect without a name: joints, with the one that is followed, place, driver."""
-    cell = UNNAMED[effect.kind]
+    cell = KINDS[effect.kind]
     joints, driver = effect.joints, cell.driver
     if 'by' in effect.detail:
         joints = (*joints, effect.detail['by'])

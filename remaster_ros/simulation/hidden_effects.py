@@ -4,7 +4,8 @@
 No code is shared with the estimation (`discovery.effects`). An effect is linear in its values:
 `HiddenEffect.values` times the contribution of its rule to a `Deviation`. A rule reads the
 `Circumstances` of every configuration. `NAMED` are the effects with a name, `UNNAMED` those
-without. Compliance and thermal growth are drawn with the sign of physics.
+without, `OF_SLIDES` those of joints that slide. Compliance and thermal growth are drawn with the
+sign of physics.
 
 A joint that slides has metres for radians and, for a torque, the force along it; a radian of the
 drawn values counts as `SLIDE_M` there.
@@ -391,6 +392,8 @@ def _along_axes(name: str) -> tuple[Part, ...]:
 NAMED: dict[str, HiddenKind] = {}
 # Effects without a name: discovery should find place and driver, or report remaining structure.
 UNNAMED: dict[str, HiddenKind] = {}
+# Effects that only an arm with a joint that slides can have.
+OF_SLIDES: dict[str, HiddenKind] = {}
 
 
 def _kind(
@@ -413,6 +416,7 @@ def _kind(
 
 
 _named, _unnamed = partial(_kind, NAMED), partial(_kind, UNNAMED)
+_of_slides = partial(_kind, OF_SLIDES)
 
 
 def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
@@ -707,7 +711,45 @@ def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.shift += e.values[0] * slow[:, None, None] * c.segments
 
 
-KINDS = NAMED | UNNAMED
+def _draw_guide(largest: float) -> Draw:
+    """Draw a wave of one half to one and a half periods along a slide, 0 if nothing slides."""
+
+    def draw(kind: str, context: DrawContext) -> HiddenEffect:
+        c, rng = context.circumstances, context.rng
+        slides = 1 + np.flatnonzero(c.per_radian != 1.0)
+        joint = int(rng.choice(slides)) if len(slides) else 1
+        across = np.cross(c.axes[joint - 1], rng.standard_normal(3))
+        detail = {
+            'axis': across / np.linalg.norm(across),
+            'per_m': 2.0 * np.pi * rng.uniform(0.5, 1.5) / max(np.ptp(c.q[:, joint - 1]), 1e-9),
+            'phase': rng.uniform(0.0, 2.0 * np.pi),
+        }
+        return HiddenEffect(kind, (joint,), np.array([largest * bool(len(slides))]), detail)
+
+    return draw
+
+
+def _along_guide(e: HiddenEffect, c: Circumstances) -> FloatArray:
+    wave = np.sin(e.detail['per_m'] * c.q[:, e.joints[0] - 1] + e.detail['phase'])
+    return e.values[0] * wave[:, None] * e.detail['axis']
+
+
+@_of_slides('link_translation', 'own_place', _draw_guide(2e-3), answers=('guide_straightness',))
+def crooked_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Shift of the carriage of joint j across its way, a wave of its place, m."""
+    d.shift[:, e.joints[0]] += _along_guide(e, c)
+
+
+@_of_slides('link_rotation', 'own_place', _draw_guide(2e-3), answers=('guide_pitch',))
+def pitching_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
+    """Turn of the carriage of joint j about an axis across its way, a wave of its place, rad."""
+    j, turn = e.joints[0], _along_guide(e, c)
+    d.tilt[:, j - 1] += turn
+    # That turns the way about its zero; the carriage stays where it is.
+    d.shift[:, j] -= np.cross(turn, c.q[:, [j - 1]] * c.axes[j - 1])
+
+
+KINDS = NAMED | UNNAMED | OF_SLIDES
 
 
 def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:

@@ -39,7 +39,7 @@ ARMS = {'rail': (rail(), 1, 0.3e-3), 'telescope': (telescope(), 3, 0.2e-3)}
 AT_A_SLIDE = {
     'rail': (
         *('encoder_scale', 'backlash', 'joint_error_curve', 'settling', 'joint_coupling'),
-        *('bent_coupling', 'foreign_torque'),
+        *('bent_coupling', 'foreign_torque', 'crooked_guide', 'pitching_guide'),
     ),
     'telescope': ('encoder_scale', 'backlash', 'joint_coupling', 'joint_compliance')
     + ('joint_axis_tilt',),
@@ -101,7 +101,7 @@ def test_what_a_slide_does_is_named_with_its_size_in_metres(arm, kind, seed):
     (effect,) = found.effects
     if kind in UNITS:
         assert {one.unit for one in effect.parameters} == {UNITS[kind]}
-    if kind != 'joint_axis_tilt':
+    if kind not in ('joint_axis_tilt', 'pitching_guide'):
         assert not any('′' in size or '°' in size for size in effect.sizes)
         assert all(' mm' in size for size in effect.sizes)
 
@@ -141,6 +141,15 @@ def test_a_correction_has_it_in_metres_and_takes_it_off(tmp_path, kind):
     left = true - model
     spread = [np.std(errors - errors.mean(axis=0)) for errors in (before, left)]
     assert spread[1] < 0.35 * spread[0]
+
+
+def test_a_crooked_guide_is_left_by_the_correction_with_its_reason(tmp_path):
+    _, _, found = discovered('rail', 'crooked_guide', 10)
+    page = save_discovery(found, tmp_path, figures=False).read_text(encoding='utf-8')
+    assert 'The guide of joint 1 is not straight' in page
+    text = (tmp_path / 'apply/compensation.json').read_text()
+    assert 'compensation.json has no term for a carriage that leaves its way' in text
+    assert read_compensation(tmp_path / 'apply/compensation.json').model.joint_terms == ()
 
 
 def _added(hidden: HiddenWorld, effects: tuple[HiddenEffect, ...]) -> np.ndarray:

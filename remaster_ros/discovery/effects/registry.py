@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from remaster_ros.discovery.effects.base import Effect
+from remaster_ros.discovery.effects.context import Context
 
 MODULES = (
     'joint_compliance',
@@ -44,6 +45,9 @@ OF_MOTION = (
 )
 """Modules of effects that only an arm shows that moves; they are tried on no other session."""
 
+OF_SLIDES = ('guide_straightness', 'guide_pitch')
+"""Modules of effects of joints that slide; they are tried on no arm without."""
+
 
 def _effect(module: str) -> Effect:
     effect: Effect = import_module(f'{__package__}.{module}').EFFECT
@@ -51,20 +55,22 @@ def _effect(module: str) -> Effect:
 
 
 class _Effects(dict[str, Effect]):
-    """Effects of every session by name; those of motion are found by name, and not listed."""
+    """Effects of every session by name; those of some are found by name, and not listed."""
 
     def __missing__(self, name: str) -> Effect:
-        return MOTION[name]
+        return MOTION[name] if name in MOTION else SLIDES[name]
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return an effect of either kind."""
-        return super().get(name, MOTION.get(name, default))
+        """Return an effect of any kind."""
+        return super().get(name, MOTION.get(name, SLIDES.get(name, default)))
 
 
 MOTION = {effect.name: effect for effect in map(_effect, OF_MOTION)}
+SLIDES = {effect.name: effect for effect in map(_effect, OF_SLIDES)}
 EFFECTS = _Effects((effect.name, effect) for effect in map(_effect, MODULES))
 
 
-def effects_of(moving: bool) -> dict[str, Effect]:
-    """Return the effects that are tried on a session."""
-    return {**EFFECTS, **MOTION} if moving else {**EFFECTS}
+def effects_of(context: Context) -> dict[str, Effect]:
+    """Return the effects that are tried on a session: those of every one, and what it can have."""
+    found = {**EFFECTS, **(MOTION if context.has_motion else {})}
+    return found | (SLIDES if context.chain.slides.any() else {})

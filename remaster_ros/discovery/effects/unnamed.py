@@ -253,9 +253,9 @@ def _frames(context: Context) -> Iterator[Candidate]:
     """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     first = angle_of(context, 1, 'angle_of_joint_1')
-    # Of a rail what twists and bends it.
-    names = ('linear', 'quadratic') if context.slides(1) else ('sin/cos',)
-    for form in (*slow, *_forms(context, first, *names)):
+    # What twists and bends a rail has a name (`guide_pitch`).
+    around = () if context.slides(1) else _forms(context, first, 'sin/cos')
+    for form in (*slow, *around):
         columns = partial(_rotated, turn=_base_turn, about=_base_origin, form=form)
         yield _candidate(
             'base_rotation', form, [f'base_r{axis}' for axis in 'xyz'], 'rad', columns

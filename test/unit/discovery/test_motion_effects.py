@@ -13,7 +13,7 @@ from worlds.moving_world import Dynamics
 
 from remaster_ros.cli.main import main
 from remaster_ros.discovery.effects.context import Context
-from remaster_ros.discovery.effects.registry import EFFECTS, MOTION, effects_of
+from remaster_ros.discovery.effects.registry import EFFECTS, MOTION
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.session.reader import write_session
 
@@ -121,7 +121,6 @@ def test_they_are_tried_on_no_arm_that_stood_still(scene):
     # Pages find equation and source of either kind.
     assert EFFECTS.get('joint_lag') is EFFECTS['joint_lag'] is MOTION['joint_lag']
     assert EFFECTS.get('none') is None
-    assert {*effects_of(True)} - {*effects_of(False)} == {*MOTION}
     still = replace(
         scene, measurements=replace(scene.measurements, velocity=None, acceleration=None)
     )
