@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from remaster_ros.calibration.gauge_words import (
     EFFECTS_PRIOR,
@@ -50,8 +51,7 @@ NEGLIGIBLE = 1e-5
 BLOCK_ROWS = 2_000
 
 
-@dataclass(frozen=True)
-class GaugeDirection:
+class GaugeDirection(Struct, frozen=True):
     """Combination of parameters that can change without any change in the data."""
 
     # Change of each parameter, rad and m, the largest entry 1. Registrations are corrections of

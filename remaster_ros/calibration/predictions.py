@@ -34,6 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from msgspec import Struct
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.result import FitResult
@@ -61,8 +62,7 @@ class Predictions:
     widening: float  # The factor on standard deviations
 
 
-@dataclass(frozen=True)
-class Coverage:
+class Coverage(Struct, frozen=True):
     """Number and share of measurements in their 95 % regions."""
 
     rows: int

@@ -14,7 +14,8 @@ from remaster_ros.calibration.gauge_words import in_a_line
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.verification import Visits, verify
 from remaster_ros.demo.configuration_times import ConfigurationTimes
-from remaster_ros.reports.schemas import Discovered, Effect, Fit
+from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.reports.schemas import Discovered, Fit
 from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
 from remaster_ros.simulation.hidden_arm import tool_points
@@ -81,7 +82,7 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
 
 def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
     """Print the found causes beside the hidden ones, and the gain."""
-    found: dict[Any, list[Effect]] = {}
+    found: dict[Any, list[FoundEffect]] = {}
     for claim in discovery.effects:
         for cause in named_cause(msgspec.to_builtins(claim)):
             found.setdefault(cause, []).append(claim)

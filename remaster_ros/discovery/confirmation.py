@@ -23,6 +23,7 @@ from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 from scipy.linalg import block_diag, cho_factor, cho_solve, cholesky
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
@@ -36,6 +37,7 @@ from remaster_ros.discovery.effects.drivers import Driver, driver_named
 from remaster_ros.discovery.effects.registry import effects_of
 from remaster_ros.discovery.effects.splines import Curve, in_turn, start_of_turn
 from remaster_ros.discovery.evidence import solve
+from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import rms
 from remaster_ros.discovery.random_effects import Family, kinds
 from remaster_ros.discovery.residuals import Residuals
@@ -69,12 +71,11 @@ SAME_ROWS = 0.1
 SHARES = (0.001, 0.003, 0.01)
 
 
-@dataclass(frozen=True)
-class Compared:
+class Compared(Struct, frozen=True):
     """Quantity compared in two sessions, in its unit: value and standard deviation of each.
 
     ``sigmas`` is the difference, other less this, over the standard deviation of both together;
-    NaN if that is zero.
+    None if that is zero.
     """
 
     name: str
@@ -83,28 +84,33 @@ class Compared:
     std: float
     other_value: float
     other_std: float
-    sigmas: float
+    sigmas: float | None
 
 
-def rms_sigmas(rows: Sequence[Compared]) -> float:
-    """Return the root mean square of the differences in standard deviations; NaN of none."""
-    squares = [row.sigmas**2 for row in rows if not np.isnan(row.sigmas)]
-    return float(np.sqrt(np.mean(squares))) if squares else float('nan')
+def rms_sigmas(rows: Sequence[Compared]) -> float | None:
+    """Return the root mean square of the differences in standard deviations; None of none."""
+    squares = [row.sigmas**2 for row in rows if row.sigmas is not None]
+    return float(np.sqrt(np.mean(squares))) if squares else None
 
 
-@dataclass(frozen=True)
-class ConfirmedCause:
-    """Result of checking one cause on the other session."""
+# Of the next two what has a default is missing in files of earlier versions.
 
-    rows_common: int  # Rows of the other session in which what drives the cause was seen here
+
+class ConfirmedCause(Struct, frozen=True):
+    """Result of checking one cause on the other session, as discovery.json has it."""
+
+    name: str
+    joints: tuple[int, ...]
     # Of what the other session could gain from this cause, beside the others fitted there, the
     # share that it gains with the cause as found here: at most 1, negative where that makes it
-    # worse; NaN if there is nothing to gain
-    carried_over: float
+    # worse; None if there is nothing to gain
+    carried_over: float | None
+    rows_common: int = 0  # Rows of the other session in which what drives the cause was seen here
     # RMS of the 3-D error in these rows without it, and with it as found here
-    rms_without_m: float
-    rms_frozen_m: float
-    parameters: tuple[Compared, ...]  # Both sessions side by side; of a curve, where both measured
+    rms_without_m: float | None = None
+    rms_frozen_m: float | None = None
+    # Both sessions side by side; of a curve, where both measured
+    parameters: tuple[Compared, ...] = ()
     # 'confirmed' (both sessions share it), 'changed' (of another size there), 'absent' (not there)
     # or 'open' (the other session cannot tell)
     answer: Answer = 'open'
@@ -112,28 +118,31 @@ class ConfirmedCause:
     log_evidence: Mapping[Choice, float] | None = None
 
 
-@dataclass(frozen=True)
-class Confirmation:
-    """Result of checking the causes found in one session on another."""
+class Confirmation(Struct, frozen=True):
+    """Result of checking the causes found in one session on another, as discovery.json has it."""
 
-    # Rows of the other session, and those of them that are common to all causes
-    rows: int
-    rows_common: int
-    # RMS of the 3-D error of the latter: without causes, with those as found here, and with the
-    # same fitted there; all else, and what this session does not tell, is fitted to the other one
+    # RMS of the 3-D error of the rows that are common to all causes: without causes, with those as
+    # found here, and with the same fitted there; all else, and what this session does not tell, is
+    # fitted to the other one
     rms_before_m: float
     rms_after_m: float
     rms_own_m: float
     # With the zero-offsets of this session too, with or without the causes, whichever is less
     rms_frozen_offsets_m: float
     # Of what the other session could gain from the causes, the share that it gains with them as
-    # found here: at most 1, negative where they make it worse; NaN with nothing to gain
-    carried_over: float
+    # found here: at most 1, negative where they make it worse; None with nothing to gain
+    carried_over: float | None
     effects: tuple[ConfirmedCause, ...]  # Each cause, in the order of the discovery
-    joint_offsets: tuple[Compared, ...]  # Zero-offsets that both sessions determine, side by side
     # More than half carries over, and the zero-offsets agree; not where nothing can be told
     confirmed: bool
     same_offsets: bool  # Whether no zero-offset that both sessions determine is another one
+    # Rows of the other session, and those of them that are common to all causes
+    rows: int = 0
+    rows_common: int = 0
+    joint_offsets: tuple[Compared, ...] = ()  # Those that both sessions determine, side by side
+    # Root mean square of the differences of zero-offsets and of causes, in standard deviations
+    offsets_rms_sigmas: float | None = None
+    parameters_rms_sigmas: float | None = None
     why: str = ''  # Why nothing can be compared; '' if it can
     # 1-based joints whose zero-offset is another one there, by the evidence
     other_joints: tuple[int, ...] = ()
@@ -148,14 +157,9 @@ class Confirmation:
         return any(cause.answer == 'absent' for cause in self.effects)
 
     @property
-    def offsets_rms_sigmas(self) -> float:
-        """Root mean square of the zero-offsets' differences in standard deviations."""
-        return rms_sigmas(self.joint_offsets)
-
-    @property
-    def parameters_rms_sigmas(self) -> float:
-        """Root mean square of the causes' differences in standard deviations."""
-        return rms_sigmas([row for effect in self.effects for row in effect.parameters])
+    def carries_over(self) -> bool:
+        """Whether more than half of what could be gained carries over."""
+        return self.carried_over is not None and self.carried_over > 0.5
 
 
 @one_thread
@@ -181,7 +185,10 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     both, best = both.most_likely()
     rows = len(both.there.data.context)
     told = [both.told(group) for group in both.groups]
-    causes = tuple(both.judged(best, index, told[index]) for index in range(len(told)))
+    causes = tuple(
+        both.judged(best, index, told[index], effect)
+        for index, effect in zip(range(len(told)), discovery.effects, strict=False)
+    )
     every = [i for group in both.groups for i in group]
     seen = np.all([np.ones(rows, dtype=bool), *told], axis=0)
     error = partial(both.error, rows=seen)
@@ -197,6 +204,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
     others = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is not None)
     undetermined = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is None)
+    side_by_side = both.offsets_side_by_side(discovery, best)
     return Confirmation(
         rows=rows,
         rows_common=int(seen.sum()),
@@ -209,8 +217,10 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
         ),
         carried_over=carried,
         effects=causes,
-        joint_offsets=both.offsets_side_by_side(discovery, best),
-        confirmed=not others and carried > 0.5 and not why,
+        joint_offsets=side_by_side,
+        offsets_rms_sigmas=rms_sigmas(side_by_side),
+        parameters_rms_sigmas=rms_sigmas([row for cause in causes for row in cause.parameters]),
+        confirmed=not others and carried is not None and carried > 0.5 and not why,
         same_offsets=not others,
         why=why,
         other_joints=others,
@@ -219,15 +229,15 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     )
 
 
-def share_of_gain(before: float, frozen: float, own: float) -> float:
+def share_of_gain(before: float, frozen: float, own: float) -> float | None:
     """Return the gain by frozen causes in mean square, as a share of the possible gain.
 
     Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
-    most 1: what frozen causes gain could be gained. NaN if that is next to nothing.
+    most 1: what frozen causes gain could be gained. None if that is next to nothing.
     """
     could = before**2 - min(own, frozen) ** 2
     if could < LEAST_GAIN * before**2:
-        return float('nan')
+        return None
     return (before**2 - frozen**2) / could
 
 
@@ -433,21 +443,25 @@ class _Both:
                 return both, best
             value, (both, best) = max(values), tried[int(np.argmax(values))]
 
-    def judged(self, best: Choices, index: int, rows: BoolArray) -> ConfirmedCause:
+    def judged(
+        self, best: Choices, index: int, rows: BoolArray, effect: FoundEffect
+    ) -> ConfirmedCause:
         """Judge one cause, all others at their best choices; RMS errors are those of `rows`.
 
-        A cause without a candidate in `found` has 0 rows and NaN errors.
+        A cause without a candidate in `found` has 0 rows and no errors.
         """
         group = self.groups[index]
         if not group:
-            return ConfirmedCause(0, np.nan, np.nan, np.nan, ())
+            return ConfirmedCause(effect.name, effect.joints, None)
         fits = {c: self.fitted(_with(best, self.joints + index, c)) for c in CHOICES}
         largest = max(fit.log_evidence for fit in fits.values())
         evidence = {choice: fit.log_evidence - largest for choice, fit in fits.items()}
         without, frozen = self.error(rows=rows, absent=group), self.error(rows=rows, frozen=group)
         return ConfirmedCause(
-            int(rows.sum()),
+            effect.name,
+            effect.joints,
             share_of_gain(without, frozen, self.error(rows=rows)),
+            int(rows.sum()),
             without,
             frozen,
             self._side_by_side(group, fits['own']),
@@ -570,14 +584,14 @@ def _compared(
 ) -> list[Compared]:
     """Compare n values of this session with those of the other, (2 n,): difference in sigmas.
 
-    This session's values come first; the difference is NaN if its standard deviation is 0.
+    This session's values come first; the difference is None if its standard deviation is 0.
     """
     found, n = [], len(names)
     variance = np.diag(covariance)
     for i, name in enumerate(names):
         mine, other = float(values[i]), float(values[n + i])
         std = float(np.sqrt(variance[i] + variance[n + i] - 2.0 * covariance[i, n + i]))
-        sigmas = (other - mine) / std if std > 0.0 else float('nan')
+        sigmas = (other - mine) / std if std > 0.0 else None
         stds = np.sqrt(variance[[i, n + i]]).tolist()
         found.append(Compared(str(name), unit, mine, stds[0], other, stds[1], sigmas))
     return found
@@ -755,7 +769,7 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         return [found.why]
     carried = (
         'the causes could gain next to nothing there'
-        if np.isnan(found.carried_over)
+        if found.carried_over is None
         else f'{percent(found.carried_over)} of what they could gain there'
     )
     lines = [
@@ -771,12 +785,13 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
             f'{percent(found.differ_by)} of its size: no model is the arm.'
         )
     offsets = (
-        f'they are {found.offsets_rms_sigmas:.1f} standard deviations apart on the average, and '
-        f'the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those found here'
+        f'they are {rms_sigmas(found.joint_offsets) or 0.0:.1f} standard deviations apart on the '
+        f'average, and the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those '
+        'found here'
     )
     own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
     holds = any(cause.answer == 'confirmed' for cause in found.effects)
-    if not found.same_offsets and not holds and not found.carried_over > 0.5:
+    if not found.same_offsets and not holds and not found.carries_over:
         return [
             f'The zero-offsets found here are not those of the other session: {offsets}, {own}. '
             'That is another arm, or it was mastered anew in between: nothing is confirmed.'
@@ -803,15 +818,15 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
 
 def _said(cause: ConfirmedCause) -> str:
     """Return the other session's answer on a cause as text, to follow its title."""
-    change = f'{1e3 * cause.rms_without_m:.3f} to {1e3 * cause.rms_frozen_m:.3f} mm RMS'
+    evidence, without, frozen = cause.log_evidence, cause.rms_without_m, cause.rms_frozen_m
+    if evidence is None or without is None or frozen is None:
+        return ': it happened once, and is no matter of the other session.'
+    change = f'{1e3 * without:.3f} to {1e3 * frozen:.3f} mm RMS'
     share = (
         f'as found here it goes from {change}'
-        if np.isnan(cause.carried_over) or cause.carried_over < 0.0
+        if cause.carried_over is None or cause.carried_over < 0.0
         else f'{percent(cause.carried_over)} of what it could gain from it, {change}'
     )
-    evidence = cause.log_evidence
-    if evidence is None:
-        return ': it happened once, and is no matter of the other session.'
     if cause.answer == 'confirmed':
         return f'. Confirmed: both sessions share it ({share}).'
     if cause.answer == 'changed':

@@ -8,10 +8,10 @@ as the standard deviations that a normal error has to have for it to be as rare 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
+from msgspec import Struct
 from scipy.special import ndtri_exp
 
 from remaster_ros.discovery.discover import Discovery
@@ -22,8 +22,10 @@ from remaster_ros.discovery.walk import NEEDED
 from remaster_ros.discovery.words import called
 from remaster_ros.linear_algebra import one_thread
 
+Answer = Literal['cause', 'look_alike', 'open', 'neither']
 
-class Named(NamedTuple):
+
+class Named(Struct, frozen=True):
     """A cause: name and joints (1-based)."""
 
     name: str
@@ -34,30 +36,34 @@ class Named(NamedTuple):
         return called(self.name, self.joints)
 
 
-@dataclass(frozen=True)
-class Decision:
-    """Decision between a cause and its look-alike."""
+class Decision(Struct, frozen=True):
+    """Decision between a cause and its look-alike, as discovery.json has it."""
 
     # As they were before
     cause: Named
     look_alike: Named
     # ``cause`` or ``look_alike``; ``open`` where odds of twenty to one are not reached;
     # ``neither`` where the search names none of the two
-    answer: Literal['cause', 'look_alike', 'open', 'neither']
-    # Of the cause less that of its look-alike; NaN if they cannot be compared
-    log_evidence: float
+    answer: Answer
+    # Of the cause less that of its look-alike; None if they cannot be compared
+    log_evidence: float | None
     sigma: float  # How sure the answer is, in standard deviations
+    sentence: str  # The same in one line
 
-    def describe(self) -> str:
-        """Return the decision in one line."""
-        if self.answer == 'neither':
-            return f'the search now names neither {self.cause} nor {self.look_alike}'
-        first, second = self.cause, self.look_alike
-        if self.log_evidence < 0.0:
-            first, second = second, first
-        if self.answer == 'open':
-            return f'still open: {first} or {second}; {self.sigma:.1f} sigma for the first'
-        return f'decided: {first}, not {second}; {self.sigma:.1f} sigma'
+    @classmethod
+    def of(
+        cls, cause: Named, look_alike: Named, answer: Answer, log_evidence: float | None = None
+    ) -> Decision:
+        """Decision by the difference of the log evidence, in numbers and words."""
+        if log_evidence is None:
+            words = f'the search now names neither {cause} nor {look_alike}'
+            return cls(cause, look_alike, answer, None, 0.0, words)
+        sigma = sigma_of(log_evidence)
+        first, second = (cause, look_alike)[:: -1 if log_evidence < 0.0 else 1]
+        words = f'decided: {first}, not {second}; {sigma:.1f} sigma'
+        if answer == 'open':
+            words = f'still open: {first} or {second}; {sigma:.1f} sigma for the first'
+        return cls(cause, look_alike, answer, log_evidence, sigma, words)
 
 
 def sigma_of(log_odds: float) -> float:
@@ -84,20 +90,20 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
     # Named are causes that the search has found now; part of a solution may be located structure.
     named = [Named(effect.name, effect.joints) for effect in found.effects]
     if cause not in named and look_alike not in named:
-        return Decision(cause, look_alike, 'neither', float('nan'), 0.0)
+        return Decision.of(cause, look_alike, 'neither')
     first, second = _evidence(found, cause, look_alike), _evidence(found, look_alike, cause)
     if first is None and second is None:
-        return Decision(cause, look_alike, 'neither', float('nan'), 0.0)
+        return Decision.of(cause, look_alike, 'neither')
     # What cannot be fitted beside the rest explains nothing.
     bare = _without(found, cause, look_alike)
     first, second = (bare if one is None else max(one, bare) for one in (first, second))
     difference = first - second
     winner = cause if difference > 0.0 else look_alike
     decided = abs(difference) > NEEDED and winner in named
-    answer: Literal['cause', 'look_alike', 'open'] = 'open'
+    answer: Answer = 'open'
     if decided:
         answer = 'cause' if difference > 0.0 else 'look_alike'
-    return Decision(cause, look_alike, answer, difference, sigma_of(difference))
+    return Decision.of(cause, look_alike, answer, difference)
 
 
 def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:

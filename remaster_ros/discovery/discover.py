@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+from msgspec import structs
 
 from remaster_ros.calibration.dynamics import clocks_of, estimate_beside, estimate_moving
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
@@ -68,8 +69,8 @@ class Discovery:
         where the causes that were searched do not hold on poses never fitted.
     effects
         The causes, the largest first.
-    gain
-        On the validation rows.
+    gain, metrics
+        On the validation rows, as `gain_of` returns them.
     pose_common_fraction
         Share of the remaining noise that all rows of a pose have in common.
     noise_by_range
@@ -117,6 +118,7 @@ class Discovery:
     verdict: Verdict
     effects: tuple[FoundEffect, ...]
     gain: Gain
+    metrics: Mapping[str, Any]
     pose_common_fraction: float
     noise_by_range: Mapping[str, Mapping[str, float]]
     outliers: tuple[tuple[int, str], ...]
@@ -227,7 +229,7 @@ def discover_session(
     sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
     named = [candidate for group in groups for candidate in group]
     try:
-        fit, gain, if_drawn = sampled(found, data, models, named)
+        fit, (gain, metrics), if_drawn = sampled(found, data, models, named)
     except InsufficientDataError as error:
         if described:
             unexplained = (unfitted(data.errors, described, error),)
@@ -241,7 +243,7 @@ def discover_session(
         bare = solve(data, ())
         assert bare is not None
         solution, groups, described, background, gain_of_all = bare, (), (), (), 0.0
-        fit, gain, if_drawn = sampled(found, data, [(bare, 1.0)], ())
+        fit, (gain, metrics), if_drawn = sampled(found, data, [(bare, 1.0)], ())
     is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
     left, gross = structure_left(data, solution, fit, structure)
@@ -299,6 +301,7 @@ def discover_session(
         verdict=verdict,
         effects=effects,
         gain=gain,
+        metrics=metrics,
         pose_common_fraction=pose_common_fraction(data, solution),
         noise_by_range=noise_by_range(data, solution),
         outliers=outliers,
@@ -321,7 +324,9 @@ def discover_session(
     )
     if result.loads_geometry:
         return result
-    effects = tuple(replace(e, remedy=NOT_LOADED) if e.in_robot_model else e for e in effects)
+    effects = tuple(
+        structs.replace(e, remedy=NOT_LOADED) if e.in_robot_model else e for e in effects
+    )
     return replace(result, effects=effects)
 
 
@@ -354,7 +359,7 @@ def _sampled(
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
-) -> tuple[FitResult, Gain, FloatArray]:
+) -> tuple[FitResult, tuple[Gain, Mapping[str, Any]], FloatArray]:
     """Sample the first of some models, each with its share, and measure its gain.
 
     Returns also the std of the zero-offsets if the arm is exactly its drawing, rad, (k,).

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import expit
 
@@ -42,8 +44,7 @@ SAME = 1.0 - 1e-6
 ROUNDING = 1e-12
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(Struct, frozen=True):
     """A parameter of an effect: posterior mean and standard deviation in its unit."""
 
     name: str
@@ -52,8 +53,7 @@ class Parameter:
     unit: str
 
 
-@dataclass(frozen=True)
-class LookAlike:
+class LookAlike(Struct, frozen=True):
     """Another cause that explains the data nearly as well."""
 
     # As of an effect
@@ -67,9 +67,8 @@ class LookAlike:
     probability: float | None = None  # That it is there and the effect is not; None: not known
 
 
-@dataclass(frozen=True)
-class FoundEffect:
-    """A cause; fields as in discovery.json."""
+class FoundEffect(Struct, frozen=True):
+    """A cause, as discovery.json has it; what has a default is missing in files of others."""
 
     name: str
     joints: tuple[int, ...]
@@ -81,7 +80,8 @@ class FoundEffect:
     log_evidence_gain: float
     confusable_with: tuple[LookAlike, ...]
     cause: str
-    size_m: float  # RMS of what it does to the marker after absorption, over the fitted rows, m
+    # RMS of what it does to the marker after absorption, over the fitted rows, m; NaN: not known
+    size_m: float = float('nan')
     # Of the gain on held-out poses, see `shares`; None if the cause was found by how far the
     # fit moved a marker, not in the residuals
     share: float | None = None
@@ -349,8 +349,7 @@ def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
     return bool(cosines.min() > SAME)
 
 
-@dataclass(frozen=True)
-class LessLikely:
+class LessLikely(Struct, frozen=True):
     """A cause that is rather not there than there."""
 
     name: str
@@ -359,9 +358,8 @@ class LessLikely:
     probability: float
 
 
-@dataclass(frozen=True)
-class SearchRecord:
-    """Agreement of the walk's chains.
+class SearchRecord(Struct, frozen=True):
+    """Agreement of the walk's chains, as discovery.json has it.
 
     ``log_posterior``: of the best model of each chain, from the offsets alone and from all kinds
     of errors on; ``models``: models of a share worth mentioning; ``best_share``: of the best.

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy
+from msgspec import Struct
 
 from remaster_ros.calibration.accuracy import accuracy_of
 from remaster_ros.calibration.comparison import predicted_rows
@@ -22,17 +22,16 @@ from remaster_ros.types import BoolArray, FloatArray
 GROSS = 7.0
 
 
-@dataclass(frozen=True)
-class Gain:
-    """RMS of the 3-D error over all validation rows, m; None without such rows."""
+class Gain(Struct, frozen=True):
+    """RMS of the 3-D error over all validation rows, m, as discovery.json has it.
+
+    None without such rows.
+    """
 
     # With offsets only, and with the effects
     held_out_rms_before_m: float | None
     held_out_rms_after_m: float | None
     noise_floor_m: float  # What the estimated noise alone leaves
-    # 'relative' and 'post_registration', each 'before' and 'after', as in fit.json; empty without
-    # validation rows
-    metrics: Mapping[str, Any]
     # How many held-out rows are single gross errors: so far off with and without the effects that
     # neither is judged by them
     held_out_gross: int = 0
@@ -47,10 +46,11 @@ def gain_of(
     solution: Solution,
     fit: FitResult,
     rng: np.random.Generator,
-) -> Gain:
-    """RMS errors of held-out rows before and after the sampled fit, and the noise floor, m.
+) -> tuple[Gain, Mapping[str, Any]]:
+    """Errors of held-out rows before and after the sampled fit, noise floor, and metrics.
 
-    Before is the fit with offsets only. Without held-out rows both errors are None.
+    Before is the fit with offsets only. Without held-out rows both errors are None. The metrics
+    are 'relative' and 'post_registration' as in fit.json; {} without held-out rows.
     """
     measurements = found.problem.measurements
     held_out = measurements.is_validation
@@ -59,7 +59,7 @@ def gain_of(
     rows = held_out if held_out.any() else ~held_out
     floor = float(np.sqrt(np.mean(variance[measurements.sensor[rows]])))
     if not held_out.any():
-        return Gain(None, None, floor, {})
+        return Gain(None, None, floor), {}
     errors_before = residuals_of(found)
     before = measurements.position - errors_before
     after = measurements.position - fit.residuals_after
@@ -73,15 +73,15 @@ def gain_of(
         # So many are no single errors: something changed there, or the model does not hold.
         gross[:] = False
     kept = held_out & ~gross
-    return Gain(
+    gain = Gain(
         rms(errors_before, held_out),
         rms(fit.residuals_after, held_out),
         floor,
-        {name: metrics[name] for name in ('relative', 'post_registration')},
         int(gross.sum()),
         rms(errors_before, kept),
         rms(fit.residuals_after, kept),
     )
+    return gain, {name: metrics[name] for name in ('relative', 'post_registration')}
 
 
 def residuals_of(found: Estimate) -> FloatArray:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from msgspec import Struct
 
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Estimate
@@ -27,15 +27,14 @@ MOST_LISTED = 3
 MOST_HARM = 1.05
 
 
-@dataclass(frozen=True)
-class Unexplained:
-    """Structure that no cause explains; fields as in discovery.json."""
+class Unexplained(Struct, frozen=True):
+    """Structure that no cause explains, as discovery.json has it."""
 
     # Where it shows, and what it follows as far as that is known
     where: str
     driver: str
     size_m: float  # RMS of the 3-D error, m
-    p_value: float  # Of seeing as much by chance; NaN if too few poses are held out
+    p_value: float | None  # Of seeing as much by chance; None if too few poses are held out
     next: str  # What it means and what to do next, one or two sentences
 
 
@@ -72,11 +71,11 @@ def harm_of(
         measurements.position - predicted_rows(found.problem, found.model, found.mode.z)
     )
     change = np.log(by_pose(fit.residuals_after) / before)
-    p_value = np.nan
+    p_value = None
     if len(change) > 1 and np.ptp(change) > 0.0:
         count = len(change)
         student = np.mean(change) / np.std(change, ddof=1) * np.sqrt(count)
-        p_value = scipy.special.stdtr(count - 1, -student)
+        p_value = float(scipy.special.stdtr(count - 1, -student))
     names = suggested(effects)
     before_m, after_m = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     assert before_m is not None
@@ -85,7 +84,7 @@ def harm_of(
         where='held_out_poses',
         driver='unknown',
         size_m=before_m,
-        p_value=float(p_value),
+        p_value=p_value,
         next=(
             f'The residuals suggest {names}, but with that the error on the held-out poses goes '
             f'from {1e3 * before_m:.3f} to {1e3 * after_m:.3f} mm RMS: it is not taken as a '
@@ -107,7 +106,7 @@ def unfitted(
         where='residuals',
         driver='unknown',
         size_m=float(np.sqrt(np.mean(np.sum(errors**2, axis=1)))),
-        p_value=np.nan,
+        p_value=None,
         next=(
             f'The residuals suggest {names}, but these poses do not determine that together with '
             f'everything else ({reason}): it is not taken as a cause. Measure poses that are '

@@ -280,7 +280,7 @@ class _Checks:
         """Entry for each error beyond the sensor's own statement, or beyond any instrument."""
         for check in self.fit.noise_checks:
             if check.is_of_no_instrument:
-                yield Unexplained('noise', 'unknown', check.error_m, np.nan, check.no_instrument)
+                yield Unexplained('noise', 'unknown', check.error_m, None, check.no_instrument)
                 continue
             if check.stated_m is None or check.explained is not False:
                 continue
@@ -289,7 +289,7 @@ class _Checks:
                 where='noise',
                 driver='stated_std',
                 size_m=check.error_m,
-                p_value=np.nan,
+                p_value=None,
                 next=(
                     f'{stating[:1].upper()}{stating[1:]} states {1e3 * check.stated_m:.3f} mm per '
                     f'axis for a reading, but the mean error is {1e3 * check.error_m:.3f} mm: '
@@ -316,7 +316,7 @@ def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
             where='noise',
             driver='pose',
             size_m=check.error_m,
-            p_value=np.nan,
+            p_value=None,
             next=(
                 f'The mean error of {the("sensor", check.sensor)} is {error_mm:.3f} mm, and what '
                 f'readings of one pose differ by explains {noise_mm:.3f} mm of it. So few poses '

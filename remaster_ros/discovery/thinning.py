@@ -10,9 +10,8 @@ the gain. The rows that were not searched test the causes with their parameters 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 
 from remaster_ros.calibration.smooth_functions import evenly
 from remaster_ros.discovery.residuals import Residuals
@@ -29,8 +28,7 @@ FEWEST_ROWS = 2
 """Of a sensor at a pose: what is common to a pose shows in no single row."""
 
 
-@dataclass(frozen=True)
-class Thinning:
+class Thinning(Struct, frozen=True):
     """Number of rows searched, and errors with the causes on all other rows."""
 
     # Rows that were searched, and all that could have been

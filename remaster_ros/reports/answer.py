@@ -27,6 +27,7 @@ from remaster_ros.compensation.export import (
 )
 from remaster_ros.compensation.loaded_errors import errors_with_urdf
 from remaster_ros.compensation.mastering import MasteringStep, mastering
+from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -48,7 +49,6 @@ from remaster_ros.reports.rows_csv import (
 )
 from remaster_ros.reports.schemas import (
     Discovered,
-    Effect,
     Fit,
     FittedGeometry,
     JointOffset,
@@ -436,7 +436,7 @@ def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
 
 def _action(
     judgement: Judgement,
-    effects: list[Effect],
+    effects: list[FoundEffect],
     before: float,
     after: float,
     offsets: list[JointOffset],
@@ -623,15 +623,13 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
     rows: list[Remaining] = []
     stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
     for effect in stay[:MOST_NAMED]:
-        sizes = effect.sizes if isinstance(effect.sizes, list) else []
-        size = '; '.join(sizes)
-        if not 0 < len(sizes) <= MOST_SIZES and isinstance(effect.size_m, float):
+        size = '; '.join(effect.sizes)
+        if not 0 < len(effect.sizes) <= MOST_SIZES and not np.isnan(effect.size_m):
             size = at_marker(effect.size_m)
-        remedy = effect.remedy if isinstance(effect.remedy, str) else ''
-        remedy = NO_FILE if effect.in_robot_model else remedy
+        remedy = NO_FILE if effect.in_robot_model else effect.remedy
         rows.append(Remaining(effect.title, size, remedy))
     if more := stay[MOST_NAMED:]:
-        largest = max(e.size_m for e in more if isinstance(e.size_m, float))
+        largest = np.nanmax([effect.size_m for effect in more])
         size = f'up to {at_marker(largest)}'
         rows.append(Remaining(counted(len(more), 'smaller cause'), size, 'See below.'))
     if found.verdict == 'undetermined':

@@ -94,7 +94,7 @@ def discovery_content(
         'effects': discovery.effects,
         'gain': discovery.gain,
         'loadable': loadable(discovery),
-        'metrics': discovery.gain.metrics,
+        'metrics': discovery.metrics,
         'noise': {
             'pose_common_fraction': discovery.pose_common_fraction,
             'outliers': [observation for observation, _ in discovery.outliers],
@@ -124,36 +124,12 @@ def discovery_content(
     if discovery.clocks:
         content['clocks'] = clocks_content(discovery.clocks)
     if decided:
-        content['decided'] = [
-            {
-                'cause': one.cause._asdict(),
-                'look_alike': one.look_alike._asdict(),
-                'answer': one.answer,
-                'log_evidence': one.log_evidence if np.isfinite(one.log_evidence) else None,
-                'sigma': one.sigma,
-                'sentence': one.describe(),
-            }
-            for one in decided
-        ]
+        content['decided'] = decided
     if confirmation is not None:
-        content['confirmation'] = confirmation_content(discovery.effects, confirmation)
+        content['confirmation'] = confirmation
     checked = schemas.checked(content, Discovered)
     checked.judgement = judgement(discovery, confirmation, checked)
     return checked
-
-
-def confirmation_content(
-    effects: Sequence[FoundEffect], confirmation: Confirmation
-) -> dict[str, Any]:
-    """Results of a confirmation in another session, as in discovery.json."""
-    return vars(confirmation) | {
-        'offsets_rms_sigmas': confirmation.offsets_rms_sigmas,
-        'parameters_rms_sigmas': confirmation.parameters_rms_sigmas,
-        'effects': [
-            {'name': effect.name, 'joints': effect.joints, **vars(cause)}
-            for effect, cause in zip(effects, confirmation.effects, strict=False)
-        ],
-    }
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
@@ -400,7 +376,7 @@ def read_causes(
     causes = tuple(
         FoundCause(
             effect.name,
-            tuple(effect.joints),
+            effect.joints,
             {parameter.name: parameter.value for parameter in effect.parameters},
             tuple((other.name, other.joints, other.separate_by) for other in _separable(effect)),
             effect.driver,
@@ -438,11 +414,9 @@ def earlier_pairs(
     found = _read(path, joint_names)
     if created and (not found.session or found.session.created != created):
         return ()
-    pairs = [
-        (_named_cause(one.cause), _named_cause(one.look_alike)) for one in found.decided or ()
-    ]
+    pairs = [(one.cause, one.look_alike) for one in found.decided or ()]
     pairs += [
-        (_named_cause(effect), _named_cause(other))
+        (Named(effect.name, effect.joints), Named(other.name, other.joints))
         for effect in found.effects
         for other in _separable(effect)
     ]
@@ -461,11 +435,6 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovere
     return found
 
 
-def _named_cause(cause: schemas.NamedCause | schemas.Effect | LookAlike) -> Named:
-    """Name and joints of a cause."""
-    return Named(cause.name, tuple(cause.joints))
-
-
-def _separable(effect: schemas.Effect) -> list[LookAlike]:
+def _separable(effect: FoundEffect) -> list[LookAlike]:
     """Look-alikes of an effect that are neither another name nor a general form of it."""
     return [other for other in effect.confusable_with if not other.same and not other.general]

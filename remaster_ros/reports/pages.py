@@ -18,7 +18,7 @@ from markupsafe import Markup
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
-from remaster_ros.discovery.explain import LookAlike
+from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.words import (
     p_value_text,
     percent,
@@ -27,7 +27,7 @@ from remaster_ros.discovery.words import (
 )
 from remaster_ros.reports.figures import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
-from remaster_ros.reports.schemas import Effect, MeasuredSession
+from remaster_ros.reports.schemas import MeasuredSession
 from remaster_ros.reports.sentences import (
     METRICS,
     NO_TIMES,
@@ -41,7 +41,7 @@ from remaster_ros.reports.sentences import (
 from remaster_ros.session.files import make_folder, write_atomically
 
 
-def law(effect: Effect) -> str:
+def law(effect: FoundEffect) -> str:
     """Equation and source of an effect; for an effect without a name, those of its form."""
     happened = effect.name == NO_NAME.name and effect.moment_s is not None
     kind = EFFECTS.get('step' if happened else effect.name)
@@ -74,18 +74,18 @@ def page(template: str, **content: Any) -> str:
             found['gain']['held_out_gross'],
         ),
         'summarized': summarized,
-        'size': lambda effect: size_words(msgspec.convert(effect, Effect)),
+        'size': lambda effect: size_words(msgspec.convert(effect, FoundEffect)),
         'look_alike': lambda other, of: look_alike_name(
-            msgspec.convert(of, Effect), msgspec.convert(other, LookAlike)
+            msgspec.convert(of, FoundEffect), msgspec.convert(other, LookAlike)
         ),
-        'law': lambda effect: law(msgspec.convert(effect, Effect)),
+        'law': lambda effect: law(msgspec.convert(effect, FoundEffect)),
     }
     return environment.get_template(template).render(**content)
 
 
 def summarized(effect: Mapping[str, Any]) -> Markup:
     """A cause with its size, for a list."""
-    size = size_words(msgspec.convert(effect, Effect))
+    size = size_words(msgspec.convert(effect, FoundEffect))
     return Markup('{} <span class="soft">({})</span>').format(effect['cause'], size)
 
 

@@ -18,7 +18,11 @@ from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.identifiability import GaugeDirection
 from remaster_ros.calibration.predictions import Coverage
-from remaster_ros.discovery.explain import CERTAIN, LookAlike, Parameter
+from remaster_ros.discovery.confirmation import Confirmation
+from remaster_ros.discovery.decision import Decision
+from remaster_ros.discovery.explain import FoundEffect, SearchRecord
+from remaster_ros.discovery.gain import Gain
+from remaster_ros.discovery.guard import Unexplained
 from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.kinematics.serial_chain import LEVER_M
 
@@ -386,77 +390,6 @@ def encode(content: Struct) -> bytes:
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
 
 
-# Keys of discovery.json that fit.json does not have.
-
-
-class NamedCause(Struct):
-    """A cause by name and joints."""
-
-    name: str
-    joints: list[int]
-
-
-class Decided(Struct):
-    """Decision between a cause and its look-alike; see `decision.Decision`."""
-
-    cause: NamedCause
-    look_alike: NamedCause
-    answer: Literal['cause', 'look_alike', 'open', 'neither']
-    log_evidence: float | None
-    sigma: float
-    sentence: str
-
-
-class Effect(Struct):
-    """A cause; ``size_m`` is the RMS at the marker after absorption, ``share`` that of the gain.
-
-    ``sizes`` are its parts in arc minutes and millimetres, ``remedy`` is the advice. ``title`` is
-    a heading, '' in files of earlier versions, which lack the keys after it, too: whether a
-    corrected robot model contains the cause, whether it lies in the measurement, and when it
-    happened if it came at one moment and stayed.
-    """
-
-    name: str
-    joints: list[int]
-    place: str
-    driver: str
-    form: str
-    parameters: list[Parameter]
-    p_value: float
-    log_evidence_gain: float
-    confusable_with: list[LookAlike]
-    cause: str
-    size_m: float | UnsetType = UNSET
-    share: float | UnsetType | None = UNSET
-    sizes: list[str] | UnsetType = UNSET
-    remedy: str | UnsetType = UNSET
-    title: str = ''
-    in_robot_model: bool = False
-    of_measurement: bool = False
-    moment_s: float | None = None
-    probability: float | None = None
-
-    @property
-    def is_taken_out(self) -> bool:
-        """Whether it is a certain error of the measurement, as in `FoundEffect`."""
-        known = self.probability is None or self.probability >= CERTAIN
-        return self.of_measurement and known
-
-
-class Gain(Struct):
-    """RMS of the 3-D error over all validation rows, and of the noise alone.
-
-    ``held_out_kept_…`` is the RMS without the ``held_out_gross`` rows that are gross errors.
-    """
-
-    held_out_rms_before_m: float | None
-    held_out_rms_after_m: float | None
-    noise_floor_m: float
-    held_out_gross: int = 0
-    held_out_kept_before_m: float | UnsetType | None = UNSET
-    held_out_kept_after_m: float | UnsetType | None = UNSET
-
-
 class Loadable(Struct):
     """A result that a robot can load, and the mean 3-D error on held-out poses with it.
 
@@ -494,60 +427,6 @@ class OffsetBefore(Struct):
     std_mm: float | UnsetType | None = UNSET
 
 
-class Compared(Struct):
-    """A parameter in both sessions, and their difference in standard deviations of both."""
-
-    name: str
-    unit: str
-    value: float
-    std: float
-    other_value: float
-    other_std: float
-    sigmas: float | None
-
-
-class ConfirmedEffect(Struct):
-    """Result for an effect in another session.
-
-    ``rows_common`` of its rows have a driver in the range of the first session; ``carried_over``
-    is the share of the possible gain there, None if nothing could be gained. ``answer`` is the
-    decision by the evidence, and ``log_evidence`` that of the cause shared by both sessions, of a
-    separate size there, and absent there, relative to the best.
-    """
-
-    name: str
-    joints: list[int]
-    carried_over: float | None
-    rows_common: int | UnsetType = UNSET
-    rms_without_m: float | UnsetType | None = UNSET
-    rms_frozen_m: float | UnsetType | None = UNSET
-    parameters: list[Compared] | UnsetType = UNSET
-    answer: Literal['confirmed', 'changed', 'absent', 'open'] | UnsetType = UNSET
-    log_evidence: dict[str, float] | UnsetType | None = UNSET
-
-
-class Confirmed(Struct):
-    """Results for all effects in another session of the arm; see `confirmation.Confirmation`."""
-
-    rms_before_m: float | None
-    rms_after_m: float | None
-    rms_own_m: float | None
-    same_offsets: bool
-    carried_over: float | None
-    confirmed: bool
-    effects: list[ConfirmedEffect]
-    rows: int | UnsetType = UNSET
-    rows_common: int | UnsetType = UNSET
-    rms_frozen_offsets_m: float | UnsetType | None = UNSET
-    joint_offsets: list[Compared] | UnsetType = UNSET
-    offsets_rms_sigmas: float | UnsetType | None = UNSET
-    parameters_rms_sigmas: float | UnsetType | None = UNSET
-    why: str | UnsetType = UNSET
-    other_joints: list[int] | UnsetType = UNSET
-    open_joints: list[int] | UnsetType = UNSET
-    differ_by: float | UnsetType = UNSET
-
-
 class PredictedRegions(Struct):
     """The 95 % regions of predictions.csv: ``widening`` is the factor on their size.
 
@@ -570,44 +449,12 @@ class JointCovariance(Struct):
     matrix: list[list[float]]
 
 
-class Unexplained(Struct):
-    """Structure that no cause explains: its place, its size, and the next step."""
-
-    where: str
-    driver: str
-    size_m: float
-    p_value: float | None
-    next: str
-
-
-class LessLikely(Struct):
-    """A cause that is rather not there than there."""
-
-    name: str
-    joints: list[int]
-    title: str
-    probability: float
-
-
-class Search(Struct):
-    """How far the chains of the walk over models agree.
-
-    ``log_posterior``: of the best model of each chain; ``models``: models of a share worth
-    mentioning, ``best_share``: share of the best.
-    """
-
-    log_posterior: list[float]
-    models: int
-    best_share: float
-    less_likely: list[LessLikely]
-
-
 class Discovered(Struct):
     """Content of discovery.json."""
 
     format: str
     verdict: Literal['effects', 'none', 'undetermined', 'unexplained']
-    effects: list[Effect]
+    effects: list[FoundEffect]
     gain: Gain
     noise: NoiseOfDiscovery
     joint_offsets_after: list[JointOffset]
@@ -617,7 +464,7 @@ class Discovered(Struct):
     metrics: Mapping[str, Any] | UnsetType = UNSET
     untestable: dict[str, str] | UnsetType = UNSET
     unexplained: list[Unexplained] | UnsetType = UNSET
-    search: Search | UnsetType = UNSET
+    search: SearchRecord | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
     sampler: Sampler | UnsetType = UNSET
     registration: dict[str, Registration] | UnsetType = UNSET
@@ -627,6 +474,6 @@ class Discovered(Struct):
     loadable: list[Loadable] | UnsetType = UNSET
     rows_searched: Thinning | UnsetType = UNSET
     clocks: dict[str, Clock] | UnsetType = UNSET
-    confirmation: Confirmed | UnsetType = UNSET
-    decided: list[Decided] | UnsetType = UNSET
+    confirmation: Confirmation | UnsetType = UNSET
+    decided: list[Decision] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET

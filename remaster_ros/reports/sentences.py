@@ -18,7 +18,7 @@ from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.compensation.export import APPLY_FOLDER, LAYER_FILE, REMASTER_FILE, URDF_FILE
-from remaster_ros.discovery.explain import LookAlike
+from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.thinning import Thinning
 from remaster_ros.discovery.words import (
     called,
@@ -31,9 +31,7 @@ from remaster_ros.discovery.words import (
 from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.reports.schemas import (
     Clock,
-    Confirmed,
     Discovered,
-    Effect,
     Fit,
     FittedGeometry,
     Imitation,
@@ -389,7 +387,7 @@ def more_than_noise(content: Discovered) -> str:
     if regions.held_out.interval95[1] < FEWEST_INSIDE:
         return f'Fewer held-out rows than should lie where they were predicted: {left}'
     after = gain.held_out_kept_after_m
-    if isinstance(after, msgspec.UnsetType):
+    if after is None:
         after = gain.held_out_rms_after_m
     most = MOST_OVER_NOISE + regions.held_out.rows**-0.5
     if after is not None and after > most * gain.noise_floor_m:
@@ -526,7 +524,7 @@ def _result(
         )
     change += _uncertain(discovery)
     them = 'it' if count == 1 else 'them'
-    if confirmation is not None and not confirmation.why and confirmation.carried_over > 0.5:
+    if confirmation is not None and not confirmation.why and confirmation.carries_over:
         if not confirmation.same_offsets:
             change += f' The other session has {them} too, with other zero-offsets.'
         elif confirmation.gone:
@@ -580,17 +578,17 @@ def at_marker(size_m: float) -> str:
     return f'{1e3 * size_m:.3f} mm RMS at the marker'
 
 
-def size_words(effect: Effect) -> str:
+def size_words(effect: FoundEffect) -> str:
     """Size of a cause, and the loss without it; '' in files of other programs."""
-    if not isinstance(effect.size_m, float):
+    if np.isnan(effect.size_m):
         return ''
-    if not isinstance(effect.share, float):
+    if effect.share is None:
         return at_marker(effect.size_m)
     lost = f'without it {percent(effect.share)} of the gain is lost'
     return f'{at_marker(effect.size_m)}, {lost}'
 
 
-def look_alike_name(effect: Effect, other: LookAlike) -> str:
+def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
     """Name of a look-alike of a cause."""
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
@@ -738,7 +736,7 @@ def _offset(row: JointOffset) -> str:
     return f'{mean:+9.4f} ± {std:.4f} {row.unit}{narrower}'
 
 
-def _to_load(rows: Sequence[Loadable], effects: Sequence[Effect] = ()) -> list[str]:
+def _to_load(rows: Sequence[Loadable], effects: Sequence[FoundEffect] = ()) -> list[str]:
     """Results that can be loaded, a line each."""
     lines = []
     for row in rows:
@@ -783,16 +781,16 @@ def discovery_lines(found: Discovered) -> list[str]:
     lines += [f'not testable: {name}: {why}' for name, why in (found.untestable or {}).items()]
     lines += found.judgement.doubts
     lines += [f'other session: {line}' for line in found.judgement.points]
-    if isinstance(found.confirmation, Struct):
+    if not isinstance(found.confirmation, UnsetType):
         lines += _side_by_side(found, found.confirmation)
     return lines + [one.sentence for one in found.decided or ()]
 
 
-def _side_by_side(found: Discovered, confirmation: Confirmed) -> list[str]:
+def _side_by_side(found: Discovered, confirmation: Confirmation) -> list[str]:
     """Table of the zero-offsets and the causes' parameters in both sessions."""
-    tables = [('zero-offsets', confirmation.joint_offsets or [])]
+    tables = [('zero-offsets', confirmation.joint_offsets)]
     tables += [
-        (effect.title, cause.parameters or [])
+        (effect.title, cause.parameters)
         for effect, cause in zip(found.effects, confirmation.effects, strict=False)
     ]
     width = max((len(row.name) for _, rows in tables for row in rows), default=0)

@@ -4,16 +4,15 @@
 import json
 import re
 import types
-from dataclasses import replace
 
 import msgspec
+from msgspec.structs import replace
 from rigs.command_line import refusal, remaster
 
 from remaster_ros.discovery.confirmation import Compared, Confirmation, ConfirmedCause, in_words
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.thinning import Thinning
-from remaster_ros.reports.discovery_json import confirmation_content
 from remaster_ros.reports.schemas import Discovered, Judgement, Loadable, checked
 from remaster_ros.reports.sentences import discovery_lines
 
@@ -78,12 +77,12 @@ def content_of(session, confirmation=None, to_load=()):
     if session.thinning is not None:
         content['rows_searched'] = session.thinning
     if confirmation is not None:
-        content['confirmation'] = confirmation_content(session.effects, confirmation)
+        content['confirmation'] = confirmation
     return checked(content, Discovered)
 
 
 def test_causes_look_alikes_and_gain_are_said():
-    text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {}), to_load=TO_LOAD)
+    text = summary(found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3), {}), to_load=TO_LOAD)
     assert 'alone, mean error on held-out poses 1.400 mm: apply/robot_calibrated.urdf, ' in text
     assert 'together, mean error on held-out poses 1.500 mm: leave it: not clearly better' in text
     assert 'can correct, mean error on held-out poses 0.300 mm: apply/compensation.json' in text
@@ -93,21 +92,21 @@ def test_causes_look_alikes_and_gain_are_said():
         'gain is lost' in text
     )
     assert 'to do: Stiffen it.' in text
-    nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4, {}), {}))
+    nothing = summary(found((replace(EFFECT, share=-0.004),), Gain(None, None, 1e-4), {}))
     assert ', without it 0 % of the gain is lost' in nothing
     assert 'could be encoder scale of joint 2; to decide: a payload' in text
     assert 'could be joint 4 alone; to decide: another payload' in text
 
 
 def test_nothing_found_and_what_cannot_be_tested_are_said():
-    text = summary(found((), Gain(None, None, 0.1e-3, {}), {'backlash': 'no from_q'}))
+    text = summary(found((), Gain(None, None, 0.1e-3), {'backlash': 'no from_q'}))
     assert 'verdict: none\nThe headline.' in text
     assert 'not testable: backlash: no from_q' in text
 
 
 def test_what_was_searched_of_a_large_session_is_said():
     part = Thinning(10_000, 80_000, 0.42e-3, 0.39e-3)
-    text = summary(found((), Gain(None, None, 0.1e-3, {}), {}, part))
+    text = summary(found((), Gain(None, None, 0.1e-3), {}, part))
     assert 'searched: 10000 of 80000 rows; the others fall from 0.420 to 0.390 mm RMS' in text
 
 
@@ -116,9 +115,12 @@ def compared(name, value, other, sigmas, unit='rad/(N m)'):
 
 
 def confirmation(share, frozen, parameters, **more):
-    answer = 'absent' if share != share else 'confirmed'
+    answer = 'absent' if share is None else 'confirmed'
     evidence = {'shared': 0.0, 'own': -3.0, 'absent': -9.0}
-    cause = ConfirmedCause(180, share, 0.9e-3, frozen, tuple(parameters), answer, evidence)
+    cause = ConfirmedCause(
+        *('joint_compliance', (2, 4), share, 180, 0.9e-3, frozen, tuple(parameters)),
+        *(answer, evidence),
+    )
     given = {
         'rows': 200,
         'rows_common': 150,
@@ -136,7 +138,7 @@ def confirmation(share, frozen, parameters, **more):
 
 
 def test_an_offset_that_no_session_determines_is_no_other_one():
-    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3), {})
     rows = [compared('compliance_2', 2e-5, 2.1e-5, 0.7)]
     text = summary(session, confirmation(0.93, 0.35e-3, rows, open_joints=(5,)))
     assert 'it is the same arm' in text
@@ -144,7 +146,7 @@ def test_an_offset_that_no_session_determines_is_no_other_one():
 
 
 def test_the_other_session_is_shown_side_by_side():
-    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3), {})
     rows = [compared('compliance_2', 2e-5, 2.1e-5, 0.7)]
     text = summary(session, confirmation(0.93, 0.35e-3, rows))
     assert '0.900 mm RMS without the causes, 0.350 mm with them as found' in text
@@ -164,17 +166,17 @@ def test_the_other_session_is_shown_side_by_side():
 
 
 def test_a_cause_that_was_cured_is_not_confirmed():
-    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
-    text = summary(session, confirmation(float('nan'), 3.3e-3, [], confirmed=False))
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3), {})
+    text = summary(session, confirmation(None, 3.3e-3, [], confirmed=False))
     assert 'the causes could gain next to nothing there' in text
     assert 'does not show it (as found here it goes from 0.900 to 3.300 mm RMS)' in text
     assert 'nan' not in text
 
 
 def test_why_nothing_can_be_compared_is_said():
-    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3, {}), {})
-    nan = float('nan')
-    nothing = Confirmation(9, 0, nan, nan, nan, nan, nan, (), (), False, False, 'Too few rows.')
+    session = found((EFFECT,), Gain(1e-3, 0.3e-3, 0.28e-3), {})
+    errors = (0.9e-3, 0.8e-3, 0.3e-3, 0.4e-3)
+    nothing = Confirmation(*errors, None, (), False, False, rows=9, why='Too few rows.')
     text = summary(session, nothing)
     assert text.endswith('other session: Too few rows.')
     assert 'nan' not in text
@@ -185,7 +187,7 @@ def test_what_was_left_open_before_is_decided(tmp_path):
     rival = LookAlike('base_compliance', (), 1.0, 'poses', title='Base compliance')
     open_one = replace(EFFECT, joints=(2,), confusable_with=(rival,))
     earlier = tmp_path / 'earlier.json'
-    content = content_of(found((open_one,), Gain(None, None, 1e-4, {}), {}))
+    content = content_of(found((open_one,), Gain(None, None, 1e-4), {}))
     earlier.write_bytes(msgspec.json.encode(content))
     options = ('--poses', 20, '--validation', 6, '--sensors', 'mocap', '--seed', 1, '--quiet')
     remaster('simulate', simulated, *options, '--effect', 'joint_compliance@2:1')

@@ -467,7 +467,9 @@ def test_without_what_makes_pdf_one_line_says_how_to_get_it(tmp_path, monkeypatc
 )
 def test_what_held_out_rows_show_to_be_more_than_noise(fit, rows, inside, after_m, says):
     content = discovery(fit, [LENGTH])
-    content.gain.held_out_rms_after_m, content.gain.noise_floor_m = after_m, 0.4e-3
+    content.gain = msgspec.structs.replace(
+        content.gain, held_out_rms_after_m=after_m, noise_floor_m=0.4e-3
+    )
     held_out = {'rows': rows, 'inside': rows, 'share': 1.0, 'interval95': inside}
     regions = {'widening': 1.0, 'held_out': held_out, 'fitted': held_out}
     content.predicted_regions95 = msgspec.convert(regions, PredictedRegions)

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from msgspec import structs
 from worlds.discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.noise import Noise, NoiseModel
@@ -72,7 +73,7 @@ def test_a_cause_that_another_session_has_with_other_offsets_is_not_called_uncon
 ):
     found, confirmation = confirmed
     content = read_discovery(saved[1] / 'discovery.json')
-    other = replace(confirmation, confirmed=False, same_offsets=False, other_joints=(3,))
+    other = structs.replace(confirmation, confirmed=False, same_offsets=False, other_joints=(3,))
     said = judgement(found, other, content)
     assert said.headline.endswith('The other session has it too, with other zero-offsets.')
     assert said.mood == 'caution'
@@ -458,7 +459,7 @@ def test_what_held_out_poses_show_is_not_said_to_be_nothing(scenes, tmp_path):
     after = 2.0 * healthy.gain.noise_floor_m
     rms = ('held_out_rms_before_m', 'held_out_rms_after_m')
     kept = ('held_out_kept_before_m', 'held_out_kept_after_m')
-    gain = replace(healthy.gain, **dict.fromkeys(rms + kept, after))
+    gain = structs.replace(healthy.gain, **dict.fromkeys(rms + kept, after))
     page, mood, _ = shown(replace(healthy, gain=gain), tmp_path, figures=False)
     assert mood == 'caution'
     assert 'Nothing was found beyond' in page
@@ -473,7 +474,7 @@ def test_gross_errors_do_not_count_among_the_rows_that_lie_where_they_were_predi
     before = discovery_json.discovery_content(healthy).predicted_regions95.held_out
     gross = tuple((int(row), 'gross') for row in m.observation[m.is_validation][:3])
     content = discovery_json.discovery_content(
-        replace(healthy, outliers=gross, gain=replace(healthy.gain, held_out_gross=3))
+        replace(healthy, outliers=gross, gain=structs.replace(healthy.gain, held_out_gross=3))
     )
     held_out = content.predicted_regions95.held_out
     assert held_out.rows == before.rows - 3
@@ -521,7 +522,7 @@ def test_a_table_without_the_optional_columns_has_its_page(tmp_path):
 
 def test_without_held_out_poses_nothing_found_is_not_proven(scenes, tmp_path):
     healthy = scenes['healthy']
-    unproven = Gain(None, None, healthy.gain.noise_floor_m, {})
+    unproven = Gain(None, None, healthy.gain.noise_floor_m)
     page, mood, _ = shown(replace(healthy, gain=unproven), tmp_path, figures=False)
     assert mood == 'caution'
     assert 'Nothing was found' in page
@@ -579,7 +580,7 @@ def test_a_cause_of_less_than_certainty_is_said_with_its_probability_and_not_gre
 ):
     bent = scenes['bent']
     (effect,), group = bent.effects, bent.groups[0]
-    doubtful = replace(effect, probability=0.7).sampled(bent.fit, group, bent.residuals)
+    doubtful = structs.replace(effect, probability=0.7).sampled(bent.fit, group, bent.residuals)
     assert 'Not certain: its probability is 70 %.' in doubtful.cause
     assert 'Not certain' not in effect.cause
     # Nobody is sent to the gearbox before it is sure.

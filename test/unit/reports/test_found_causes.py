@@ -6,6 +6,7 @@ import json
 import pytest
 from worlds.discovery_files import discovery_content, effect, look_alike
 
+from remaster_ros.discovery.decision import Named
 from remaster_ros.errors import InputError
 from remaster_ros.reports.discovery_json import earlier_pairs, read_causes
 
@@ -34,7 +35,9 @@ def test_what_nothing_separates_is_left_out(tmp_path):
     (cause,) = read_causes(path, observations_sha256='ab')
     assert cause.look_alikes == (('base_compliance', (), 'poses'),)
     assert cause.driver == 'gravity_torque'
-    assert earlier_pairs(path) == ((('joint_compliance', (2,)), ('base_compliance', ())),)
+    assert earlier_pairs(path) == (
+        (Named('joint_compliance', (2,)), Named('base_compliance', ())),
+    )
     with pytest.raises(InputError, match='nothing to separate'):
         read_causes(written(tmp_path, look_alike('link_length', (3,), same=True)))
 
@@ -67,6 +70,6 @@ def test_what_was_decided_is_looked_at_again(tmp_path):
     }  # fmt: skip
     path = written(tmp_path, look_alike('base_compliance'), decided=[decided])
     assert earlier_pairs(path) == (
-        (('backlash', (4,)), ('settling', (4,))),
-        (('joint_compliance', (2,)), ('base_compliance', ())),
+        (Named('backlash', (4,)), Named('settling', (4,))),
+        (Named('joint_compliance', (2,)), Named('base_compliance', ())),
     )
