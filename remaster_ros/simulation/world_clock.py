@@ -116,13 +116,15 @@ class Pace:
             taken_s += self._confirmed_every_s
             while self._reports and self._reports[0][1] <= min(taken_s, led_s):
                 self._reports.popleft()
-            reports = [published_s for _, published_s in self._reports]
-        since = [published_s for published_s in reports if published_s > taken_s][:1]
-        since += _progress_of_running(self._fakes, wall)
-        untaken = [published_s + LEAD_AHEAD_S for published_s in reports if published_s > led_s][
-            :1
-        ]
-        self._clock.hold(min([*untaken, min([now, *since]) + self._ahead_s, most_s]))
+            untaken_s, not_led_s = self._first_after(taken_s), self._first_after(led_s)
+        slowest_s = min([now, untaken_s, *_progress_of_running(self._fakes, wall)])
+        self._clock.hold(min(not_led_s + LEAD_AHEAD_S, slowest_s + self._ahead_s, most_s))
+
+    def _first_after(self, done_s: float) -> float:
+        """World time of the first report after a progress, s; infinite without such a report."""
+        return next(
+            (published_s for _, published_s in self._reports if published_s > done_s), math.inf
+        )
 
 
 def _progress_of_running(
