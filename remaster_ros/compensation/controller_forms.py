@@ -43,7 +43,8 @@ from remaster_ros.compensation.export import (
     written_notes,
     xml_text,
 )
-from remaster_ros.compensation.file import Compensation, LeftPart
+from remaster_ros.compensation.file import Compensation
+from remaster_ros.compensation.of_result import NotCorrected
 from remaster_ros.compensation.pad_pages import PAD_PAGES, MotorNumber, motor_text
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import (
@@ -111,14 +112,14 @@ class HeldByForm:
     # Error at the marker with this content, over the measured range
     rms_mm: float
     max_mm: float
-    uncorrectable: tuple[LeftPart, ...] = ()  # Effects that no form corrects
+    uncorrectable: tuple[NotCorrected, ...] = ()  # Effects that no form corrects
     better_file: str = ''  # Advice to export a file that is nearer to the measurements; ''
 
     @property
     def words(self) -> list[str]:
         """The errors that remain, a line each."""
 
-        def of_joints(joints: list[int]) -> str:
+        def of_joints(joints: Sequence[int]) -> str:
             several = 's' if len(joints) > 1 else ''
             return f' of joint{several} {", ".join(map(str, joints))}' if joints else ''
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,8 +13,9 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Struct, UnsetType, structs
 
+from remaster_ros.calibration.records import Marker, Registration, Robot, Triple
 from remaster_ros.compensation.arm_model import (
     GRAVITY,
     ArmModel,
@@ -26,18 +27,15 @@ from remaster_ros.compensation.arm_model import (
     JointTerm,
 )
 from remaster_ros.compensation.compensator import Compensator
-from remaster_ros.compensation.of_result import CorrectedArm
+from remaster_ros.compensation.of_result import CorrectedArm, Mount, NotCorrected
 from remaster_ros.compensation.trajectories import CorrectedTrajectory, corrected_trajectory
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import (
-    matrix_from_quaternion_xyzw,
-    quaternion_xyzw,
-    transform,
-)
+from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.session.files import read_limited
-from remaster_ros.types import Controller, FloatArray, IntArray
+from remaster_ros.session.json_records import plain
+from remaster_ros.types import Controller, FloatArray, Session
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-compensation/1'
@@ -50,18 +48,12 @@ DIGITS = 10
 # sensor), and with a finite fourth power.
 LARGEST = 1e9
 
-Triple = tuple[float, float, float]
 Source = Literal['fit', 'discover']
 
 
-class RobotPart(Struct):
+class RobotPart(Robot):
     """The nominal robot, with the whole text of its URDF."""
 
-    name: str
-    urdf_sha256: str
-    base_link: str
-    tip_link: str
-    joint_names: list[str]
     urdf: str
 
 
@@ -154,40 +146,6 @@ class ParametersPart(Struct):
     error: ErrorPart | UnsetType = UNSET
 
 
-class FramePart(Struct):
-    """Pose of a sensor's frame N in R; std of shifts at the origin of R, and of rotations."""
-
-    translation_m: Triple
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: Triple
-    std_rad: Triple
-
-
-class MarkerPart(Struct):
-    """Position of a marker in T."""
-
-    position_m: Triple
-    std_m: Triple
-
-
-class MountPart(Struct):
-    """Sensor on the tool: its origin is at a marker; its rotation in T, if known."""
-
-    marker: str
-    rotation_xyzw: tuple[float, float, float, float] | UnsetType = UNSET
-    std_rad: Triple | UnsetType = UNSET
-
-
-class LeftPart(Struct):
-    """An effect that is not corrected."""
-
-    effect: str
-    joints: list[int]
-    size_mm: float
-    why: str
-    instead: str
-
-
 class CompensationPart(Struct):
     """Content of the file."""
 
@@ -200,16 +158,17 @@ class CompensationPart(Struct):
     masses: list[MassPart]
     gravity_m_s2: Triple
     parameters: ParametersPart
-    base_frame: dict[str, FramePart]
-    tool: dict[str, MarkerPart]
-    not_corrected: list[LeftPart]
+    # Stds of registrations are of shifts at the origin of R, and of rotations
+    base_frame: dict[str, Registration]
+    tool: dict[str, Marker]
+    not_corrected: list[NotCorrected]
     notes: list[str]
     base_terms: list[TermPart] = []
     temperature: TemperaturePart | None = None
     controller: Controller | None = None
     # Sensors on the tool, whose `base_frame` is the pose of the target that they see; unset in
     # files of earlier versions.
-    on_tool: dict[str, MountPart] | UnsetType = UNSET
+    on_tool: dict[str, Mount] | UnsetType = UNSET
 
     def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
         """Offset or range of each joint, rad, m for prismatic ones, (k, ...)."""
@@ -257,139 +216,97 @@ _FRAMES = (
 )
 
 
-def written(
-    described: CorrectedArm,
-    urdf: str,
-    made_by: Source,
-    hashes: tuple[str, str],
-    state: Mapping[str, Any],
-    controller: Controller | None = None,
-    on_tool: Mapping[str, MountPart] | None = None,
-) -> str:
+def written(described: CorrectedArm, session: Session, made_by: Source, result_sha256: str) -> str:
     """Text of compensation.json.
 
     Parameters
     ----------
     described
         Model of the arm, and the effects that are not corrected.
-    urdf
-        Text of the nominal robot.
-    made_by
-        Command that made the result.
-    hashes
-        SHA-256 of the result's file and of observations.csv.
-    state
-        State of the controller during the measurements.
-    controller
-        How the robot's own pad counts the joints.
-    on_tool
-        Sensors that are on the tool.
+    session
+        Session that the result is of.
+    made_by, result_sha256
+        Command that made the result, and the hash of its file.
     """
     model, chain = described.model, described.model.chain
     joints = [term.joint for term in model.joint_terms]
     assert joints == sorted(joints), 'parameters of terms are counted as they stand in the file'
-    names = chain.joint_names
-    std = np.linalg.norm(model.root, axis=0)
+    names, std = chain.joint_names, np.linalg.norm(model.root, axis=0)
     kept, root = _triangle(model.root)
-    error: ErrorPart | UnsetType = UNSET
+    parameters: dict[str, Any] = {
+        'names': [model.parameter_names[i] for i in kept],
+        'units': [model.parameter_units[i] for i in kept],
+        'mean': model.parameter_means[kept],
+        'covariance_root': root,
+        'widening': model.widening,
+    }
     if model.error_root is not None:
-        error_columns, error_root = _triangle(model.error_root)
-        error = ErrorPart([model.parameter_names[i] for i in error_columns], error_root)
-    content = CompensationPart(
-        format=FORMAT,
-        robot=RobotPart(
-            chain.name,
-            hashlib.sha256(urdf.encode()).hexdigest(),
-            chain.base_link,
-            chain.tip_link,
-            list(names),
-            urdf,
-        ),
-        source=SourcePart(made_by, *hashes, __version__),
-        state=dict(state),
-        joints=[
-            JointPart(
-                joint=name,
-                identifiable=described.identifiable[j],
-                why=described.why[j],
-                terms=[
-                    _term(term.effect, term.function, term.coefficients, chain)
-                    for term in model.joint_terms
-                    if term.joint == j
-                ],
-                **_in_unit(
-                    chain.units[j], float(model.joint_offsets[j]), _pair(described.ranges[j])
-                ),
-            )
-            for j, name in enumerate(names)
+        kept, root = _triangle(model.error_root)
+        parameters['error'] = {'names': [model.parameter_names[i] for i in kept], 'root': root}
+    temperature = {
+        'reference_c': model.reference_c,
+        'measured_at_c': model.mean_c,
+        'origins': _origins(model.growth, names),
+    }
+    content = {
+        'format': FORMAT,
+        'robot': {**structs.asdict(Robot.of(session, chain)), 'urdf': session.urdf},
+        'source': SourcePart(made_by, result_sha256, session.observations_sha256, __version__),
+        'state': {'correction': session.correction, 'accuracy_option': session.accuracy_option},
+        'joints': [
+            {
+                'joint': name,
+                f'offset_{unit}': model.joint_offsets[j],
+                'identifiable': described.identifiable[j],
+                'why': described.why[j],
+                f'range_{unit}': described.ranges[j],
+                'terms': [_term(term, chain) for term in model.joint_terms if term.joint == j],
+            }
+            for j, (name, unit) in enumerate(zip(names, chain.units, strict=True))
         ],
-        geometry=GeometryPart(_FRAMES, _origins(model.geometry, names)),
-        masses=[
-            MassPart(
-                name,
-                float(chain.masses[j]),
-                _triple(chain.centers_of_mass[j]),
-                float(model.lateral_compliance[j]) if model.lateral_compliance[j] else UNSET,
+        'geometry': {'frames': _FRAMES, 'origins': _origins(model.geometry, names)},
+        'masses': [
+            {'joint': name, 'mass_kg': mass, 'center_m': center}
+            | ({'lateral_compliance': compliance} if compliance else {})
+            for name, mass, center, compliance in zip(
+                names, chain.masses, chain.centers_of_mass, model.lateral_compliance, strict=True
             )
-            for j, name in enumerate(names)
         ],
-        gravity_m_s2=GRAVITY,
-        base_terms=[
-            _term(term.effect, term.function, term.coefficients, chain)
-            for term in model.base_terms
-        ],
-        temperature=TemperaturePart(model.reference_c, model.mean_c, _origins(model.growth, names))
-        if model.grows
-        else None,
-        parameters=ParametersPart(
-            [model.parameter_names[i] for i in kept],
-            [model.parameter_units[i] for i in kept],
-            model.parameter_means[kept].tolist(),
-            root,
-            model.widening,
-            error,
-        ),
-        base_frame={
-            sensor: FramePart(
-                _triple(T[:3, 3]),
-                _four(quaternion_xyzw(T[:3, :3])),
-                *(_triple(std[where]) for where in model.registration(sensor)),
-            )
+        'gravity_m_s2': GRAVITY,
+        'parameters': parameters,
+        'base_frame': {
+            sensor: {
+                'translation_m': T[:3, 3],
+                'rotation_xyzw': quaternion_xyzw(T[:3, :3]),
+                'std_m': std[model.registration(sensor)[0]],
+                'std_rad': std[model.registration(sensor)[1]],
+            }
             for sensor, T in model.T_R_N.items()
         },
-        tool={
-            marker: MarkerPart(_triple(place), _triple(std[model.marker(marker)]))
+        'tool': {
+            marker: {'position_m': place, 'std_m': std[model.marker(marker)]}
             for marker, place in model.markers.items()
         },
-        not_corrected=[
-            LeftPart(one.effect, list(one.joints), 1e3 * one.size_m, one.why, one.instead)
-            for one in described.not_corrected
-        ],
-        notes=list(described.notes),
-        controller=controller,
-        on_tool=dict(on_tool or {}),
-    )
-    encoder = msgspec.json.Encoder()
-    lines = [
-        f'  {encoder.encode(name).decode()}: {encoder.encode(value).decode()}'
-        for name, value in msgspec.structs.asdict(content).items()
-    ]
+        'not_corrected': described.not_corrected,
+        'notes': described.notes,
+        'base_terms': [_term(term, chain) for term in model.base_terms],
+        'temperature': temperature if model.grows else None,
+        'controller': session.controller,
+        'on_tool': described.mounts
+        or {sensor: Mount(session.sensors[sensor]) for sensor in session.on_tool},
+    }
+    encode = msgspec.json.Encoder(enc_hook=plain).encode
+    lines = [f'  "{key}": {encode(value).decode()}' for key, value in content.items()]
     return '{\n' + ',\n'.join(lines) + '\n}\n'
 
 
-def _in_unit(unit: str, offset: float, both: tuple[float, float]) -> dict[str, Any]:
-    """Keys and values of the offset and range of a joint in its unit."""
-    return {f'offset_{unit}': offset, f'range_{unit}': both}
-
-
-def _triangle(root: FloatArray) -> tuple[IntArray, list[list[float]]]:
-    """Columns of a root (r, p) that are not zero.
-
-    Last result: rows of its triangle from the diagonal on.
-    """
+def _triangle(root: FloatArray) -> tuple[list[int], list[list[float]]]:
+    """Columns of a root (r, p) that are not zero; rows of its triangle from the diagonal on."""
     kept = np.flatnonzero(np.any(root != 0.0, axis=0))
     rows = np.asarray(np.linalg.qr(root[:, kept], 'r')).tolist()
-    return kept, [[float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(rows)]
+    return kept.tolist(), [
+        [float(f'{v:.{DIGITS}g}') for v in row[i:]] for i, row in enumerate(rows)
+    ]
 
 
 def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
@@ -402,49 +319,33 @@ def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
     return f'knots_{chain.units[joint]}' if driver == 'angle' else 'knots'
 
 
-def _term(
-    effect: str, function: Function, coefficients: FloatArray, chain: SerialChain
-) -> TermPart:
-    """Term of the file for a function."""
-    part = TermPart(effect, function.driver, function.form, coefficients.tolist())
+def _term(term: JointTerm | BaseTerm, chain: SerialChain) -> dict[str, Any]:
+    """Term of the file for a term of the model."""
+    function = term.function
+    part: dict[str, Any] = {'effect': term.effect, 'coefficients': term.coefficients}
+    part |= {'driver': function.driver, 'form': function.form}
     if function.driver != 'none':
-        part.driver_at = _taken_at(function.driver)
+        part['driver_at'] = _taken_at(function.driver)
     if function.joint >= 0:
-        part.driver_joint = chain.joint_names[function.joint]
+        part['driver_joint'] = chain.joint_names[function.joint]
     if function.order:
-        part.order = function.order
+        part['order'] = function.order
     if function.form == 'bspline':
-        setattr(part, _knots_key(function.driver, function.joint, chain), function.knots.tolist())
-        part.degree = function.degree
+        key = _knots_key(function.driver, function.joint, chain)
+        part |= {key: function.knots, 'degree': function.degree}
         if not np.isnan(function.turn_start):
-            part.turn_start_rad = float(function.turn_start)
+            part['turn_start_rad'] = function.turn_start
     return part
 
 
-def _origins(geometry: Geometry, names: Sequence[str]) -> list[OriginPart]:
+def _origins(geometry: Geometry, names: Sequence[str]) -> list[dict[str, Any]]:
     """Origins of the file that are changed."""
+    rows = zip((*names, 'tool'), geometry.shifts, geometry.turns, strict=True)
     return [
-        OriginPart(name, _triple(shift), _triple(turn))
-        for name, shift, turn in zip(
-            (*names, 'tool'), geometry.shifts, geometry.turns, strict=True
-        )
+        {'at': name, 'shift': shift, 'turn': turn}
+        for name, shift, turn in rows
         if np.any(shift) or np.any(turn)
     ]
-
-
-def _triple(values: FloatArray) -> Triple:
-    """Three numbers as a tuple of floats."""
-    x, y, z = (float(value) for value in values)
-    return x, y, z
-
-
-def _four(values: FloatArray) -> tuple[float, float, float, float]:
-    x, y, z, w = (float(value) for value in values)
-    return x, y, z, w
-
-
-def _pair(values: FloatArray) -> tuple[float, float]:
-    return float(values[0]), float(values[1])
 
 
 def read_compensation(path: str | os.PathLike[str]) -> Compensation:
@@ -481,18 +382,20 @@ def of_text(data: bytes, path: Path) -> Compensation:
 
 def _refuse_huge(content: CompensationPart) -> None:
     """Raise InputError for numbers beyond any arm's, whose products would overflow."""
-    parts = msgspec.to_builtins(content)
-    # What the controller reported is shown, never computed with.
-    del parts['state']
-    waiting: list[tuple[str, Any]] = [('', parts)]
-    while waiting:
-        where, value = waiting.pop()
-        if isinstance(value, dict):
-            waiting += [(f'{where}.{key}' if where else key, one) for key, one in value.items()]
-        elif isinstance(value, list | tuple):
-            waiting += [(f'{where}.{i}', one) for i, one in enumerate(value)]
-        elif isinstance(value, int | float) and abs(value) > LARGEST:
-            raise _broken(where, f'is {value:.3g}, beyond what any arm has')
+    for key, part in msgspec.to_builtins(content).items():
+        # What the controller reported is shown, never computed with.
+        for where, value in _numbers(part, key) if key != 'state' else ():
+            if abs(value) > LARGEST:
+                raise _broken(where, f'is {value:.3g}, beyond what any arm has')
+
+
+def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
+    """Yield all numbers of a part of the file, and their places."""
+    if isinstance(value, int | float):
+        yield where, value
+    elif not isinstance(value, str | None):
+        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _numbers(one, f'{where}.{key}')
 
 
 class _AnyFile(Struct):
@@ -537,7 +440,7 @@ def _model(content: CompensationPart) -> ArmModel:
         index = names.index(part.joint)
         if (part.mass_kg, part.center_m) != (
             chain.masses[index],
-            _triple(chain.centers_of_mass[index]),
+            tuple(chain.centers_of_mass[index]),
         ):
             raise _broken(f'masses of {part.joint}', 'are not those of its URDF')
     for joint, unit in zip(content.joints, chain.units, strict=True):
@@ -585,10 +488,7 @@ def _model(content: CompensationPart) -> ArmModel:
         ),
         reference_c=warm.reference_c if warm else np.nan,
         mean_c=warm.measured_at_c if warm else np.nan,
-        T_R_N={
-            sensor: transform(matrix_from_quaternion_xyzw(part.rotation_xyzw), part.translation_m)
-            for sensor, part in content.base_frame.items()
-        },
+        T_R_N={sensor: part.T_R_N for sensor, part in content.base_frame.items()},
         markers={name: np.array(part.position_m) for name, part in content.tool.items()},
         root=np.zeros((0, 0)),
         widening=content.parameters.widening,

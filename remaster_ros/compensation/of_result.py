@@ -13,12 +13,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
+from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.comparison import predicted_rows
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.noise_estimate import noise_estimates
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.calibration.predictive_accuracy import Predictive
+from remaster_ros.calibration.records import Quaternion, Triple
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.compensation.arm_model import (
     ArmModel,
@@ -64,15 +67,22 @@ class Slot:
     function: Function | None = None
 
 
-@dataclass(frozen=True)
-class NotCorrected:
-    """An effect that a correction leaves."""
+class NotCorrected(Struct, frozen=True):
+    """An effect that a correction leaves, as compensation.json has it."""
 
     effect: str  # Name in discovery.json
     joints: tuple[int, ...]
-    size_m: float  # RMS displacement of the marker over the rows of the session, m
+    size_mm: float  # RMS displacement of the marker over the rows of the session, mm
     why: str  # Reason, a sentence
     instead: str  # Remedy, a sentence
+
+
+class Mount(Struct, frozen=True):
+    """Sensor on the tool, as compensation.json has it: its marker; its rotation in T, if known."""
+
+    marker: str  # Marker at the origin of the sensor
+    rotation_xyzw: Quaternion | UnsetType = UNSET
+    std_rad: Triple | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +96,9 @@ class CorrectedArm:
     # Least and largest reported angle of each joint in the rows fitted, rad or m, (k, 2)
     ranges: FloatArray
     not_corrected: tuple[NotCorrected, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    # Sensors on the tool with their rotations; {} if none is known
+    mounts: Mapping[str, Mount] = field(default_factory=dict)
 
 
 def arm_of_offsets(
@@ -179,6 +191,35 @@ def arm_of_effects(
         Residuals in which the effects were sought.
     """
     return _described(fit, candidates, fit.theta, data, 1.0)
+
+
+def mounts_of(fit: FitResult, model: ArmModel) -> dict[str, Mount]:
+    """Rotation of each sensor on the tool, by its name, with the arm of a correction.
+
+    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are not
+    identifiable: with it the rotation is the mean that the fitted rows show.
+    """
+    session, found, m = fit.session, fit.orientations, fit.measurements
+    left_out = [observation for observation, _ in fit.left_out]
+    mounts = {}
+    for sensor in sorted(session.on_tool):
+        marker = session.sensors[sensor]
+        mounts[sensor] = Mount(marker)
+        # Bodies have the sensor's name behind the marker's where several sensors measure one.
+        names = marker, f'{marker}.{sensor}'
+        body = next((name for name in names if found is not None and name in found.R_T_B), '')
+        if body and found is not None and m.orientation is not None:
+            rows = (m.sensor == session.sensor_names.index(sensor)) & ~m.is_validation
+            rows &= ~np.isin(m.observation, left_out) & np.isfinite(m.orientation).all(axis=1)
+            R_R_T = model.state(m.q[rows]).tool[:, :3, :3]
+            R_R_C = (
+                model.T_R_N[sensor][:3, :3] @ Rotation.from_quat(m.orientation[rows]).as_matrix()
+            )
+            R_T_C = Rotation.from_matrix(np.swapaxes(R_R_T, 1, 2) @ R_R_C).mean()
+            x, y, z, w = R_T_C.as_quat().tolist()
+            about_x, about_y, about_z = np.asarray(found.std_rad[body]).tolist()
+            mounts[sensor] = Mount(marker, (x, y, z, w), (about_x, about_y, about_z))
+    return mounts
 
 
 def _described(
@@ -483,9 +524,9 @@ def _not_corrected(
         by_effect[key] = by_effect[key] + displacement if key in by_effect else displacement
         remedies[key] = EFFECTS[candidate.name].remedy_of(candidate)
     for (name, joints, why), displacement in by_effect.items():
-        size = float(np.sqrt(np.mean(np.sum(displacement**2, axis=-1))))
-        if round(1e3 * size, 3) == 0.0:
+        size_mm = 1e3 * float(np.sqrt(np.mean(np.sum(displacement**2, axis=-1))))
+        if round(size_mm, 3) == 0.0:
             # It shows as nothing wherever it is listed.
             continue
         reported = EFFECTS[name].reported_as or name
-        yield NotCorrected(reported, joints, size, why, remedies[name, joints, why])
+        yield NotCorrected(reported, joints, size_mm, why, remedies[name, joints, why])

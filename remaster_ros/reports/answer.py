@@ -31,7 +31,6 @@ from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, transform
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
     FIT_FILE,
@@ -116,11 +115,7 @@ class Inputs:
     def T_R_N(self) -> dict[str, FloatArray]:
         """Fitted registration of each sensor, (4, 4)."""
         return {
-            sensor: transform(
-                matrix_from_quaternion_xyzw(np.array(frame.rotation_xyzw)),
-                np.array(frame.translation_m),
-            )
-            for sensor, frame in self.fit.registration.items()
+            sensor: registration.T_R_N for sensor, registration in self.fit.registration.items()
         }
 
 

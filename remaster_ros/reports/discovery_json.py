@@ -19,7 +19,7 @@ from remaster_ros.compensation.export import (
     URDF_FILE,
     exports,
 )
-from remaster_ros.compensation.file import COMPENSATION_FILE, of_text
+from remaster_ros.compensation.file import COMPENSATION_FILE, of_text, written
 from remaster_ros.compensation.loaded_errors import (
     errors_with_correction,
     errors_with_urdf,
@@ -44,7 +44,6 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
     clocks_content,
-    correction_text,
     estimates,
     model_text,
     of_joints,
@@ -52,6 +51,7 @@ from remaster_ros.reports.fit_json import (
 )
 from remaster_ros.reports.schemas import Discovered, Loadable
 from remaster_ros.reports.sentences import judgement
+from remaster_ros.session.json_records import checked
 from remaster_ros.types import FloatArray
 from remaster_ros.version import __version__
 
@@ -127,9 +127,9 @@ def discovery_content(
         content['decided'] = decided
     if confirmation is not None:
         content['confirmation'] = confirmation
-    checked = schemas.checked(content, Discovered)
-    checked.judgement = judgement(discovery, confirmation, checked)
-    return checked
+    found = checked(content, Discovered)
+    found.judgement = judgement(discovery, confirmation, found)
+    return found
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
@@ -193,9 +193,7 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
         )
         files[MODEL_FILE] = model_text(discovery.alone, geometry)
     described = compensation_of(discovery, widening)
-    files[COMPENSATION_FILE] = correction_text(
-        described, discovery.fit.session, 'discover', result_sha256
-    )
+    files[COMPENSATION_FILE] = written(described, discovery.fit.session, 'discover', result_sha256)
     return files
 
 
@@ -223,7 +221,7 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
         )
     described = arm_of_offsets(alone, predict(alone, rows).widening, notes, geometry)
     uncorrected = tuple(
-        NotCorrected(e.name, e.joints, e.size_m, _ALONE, e.remedy) for e in discovery.effects
+        NotCorrected(e.name, e.joints, 1e3 * e.size_m, _ALONE, e.remedy) for e in discovery.effects
     )
     return replace(described, not_corrected=uncorrected)
 
@@ -263,7 +261,7 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
         )
     described = _arm_with_effects(discovery)
     if described.model.largest_slope() < 1.0:
-        text = correction_text(described, session, 'discover', '').encode()
+        text = written(described, session, 'discover', '').encode()
         of_measuring = np.repeat(
             np.array([candidate.of_measurement for candidate in candidates], dtype=bool),
             [candidate.size for candidate in candidates],

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import msgspec
 import numpy as np
 from msgspec import UNSET
-from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.calibration.priors import DRAWING_TAILS
-from remaster_ros.compensation.arm_model import ArmModel, Geometry
+from remaster_ros.calibration.records import Robot
+from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import (
     APPLY_FOLDER,
     MODEL_FILE,
@@ -25,15 +25,14 @@ from remaster_ros.compensation.export import (
     calibrated_urdf,
     exports,
 )
-from remaster_ros.compensation.file import (
-    COMPENSATION_FILE,
-    MountPart,
-    Source,
-    of_text,
-    written,
-)
+from remaster_ros.compensation.file import COMPENSATION_FILE, of_text, written
 from remaster_ros.compensation.loaded_errors import errors_with_correction, errors_with_urdf
-from remaster_ros.compensation.of_result import CorrectedArm, arm_of_geometry, arm_of_offsets
+from remaster_ros.compensation.of_result import (
+    CorrectedArm,
+    arm_of_geometry,
+    arm_of_offsets,
+    mounts_of,
+)
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -42,6 +41,7 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
+from remaster_ros.session.json_records import Record, checked
 from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
@@ -66,13 +66,7 @@ def estimates(result: FitResult) -> dict[str, Any]:
     session, sampler = result.session, result.sampler
     limits = {'std_is_lower_limit': True} if result.other_errors else {}
     return {
-        'robot': {
-            'name': result.chain.name,
-            'urdf_sha256': session.urdf_sha256,
-            'joint_names': result.joint_names,
-            'base_link': session.base_link,
-            'tip_link': session.tip_link,
-        },
+        'robot': Robot.of(session, result.chain),
         'session': _describe(session),
         'joint_offsets': _offsets(result),
         'registration': {
@@ -203,55 +197,8 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
 
 def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
     """compensation.json of a corrected arm of a fit."""
-    mounts = _mounts(result, described.model)
-    return correction_text(described, result.session, 'fit', result_sha256, mounts)
-
-
-def _mounts(result: FitResult, model: ArmModel) -> dict[str, MountPart]:
-    """Rotation of each sensor on the tool, by its name, with the arm of a correction.
-
-    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are not
-    identifiable: with it the rotation is the mean that the fitted rows show.
-    """
-    session, found, m = result.session, result.orientations, result.measurements
-    left_out = [observation for observation, _ in result.left_out]
-    mounts = {}
-    for sensor in sorted(session.on_tool):
-        mount = MountPart(session.sensors[sensor])
-        # Bodies have the sensor's name behind the marker's where several sensors measure one.
-        names = mount.marker, f'{mount.marker}.{sensor}'
-        body = next((name for name in names if found is not None and name in found.R_T_B), '')
-        if body and found is not None and m.orientation is not None:
-            rows = (m.sensor == session.sensor_names.index(sensor)) & ~m.is_validation
-            rows &= ~np.isin(m.observation, left_out) & np.isfinite(m.orientation).all(axis=1)
-            R_R_T = model.state(m.q[rows]).tool[:, :3, :3]
-            R_R_C = (
-                model.T_R_N[sensor][:3, :3] @ Rotation.from_quat(m.orientation[rows]).as_matrix()
-            )
-            R_T_C = Rotation.from_matrix(np.swapaxes(R_R_T, 1, 2) @ R_R_C).mean()
-            x, y, z, w = R_T_C.as_quat().tolist()
-            about_x, about_y, about_z = np.asarray(found.std_rad[body]).tolist()
-            mount = MountPart(mount.marker, (x, y, z, w), (about_x, about_y, about_z))
-        mounts[sensor] = mount
-    return mounts
-
-
-def correction_text(
-    described: CorrectedArm,
-    session: Session,
-    made_by: Source,
-    result_sha256: str,
-    mounts: Mapping[str, MountPart] | None = None,
-) -> str:
-    """compensation.json of a corrected arm.
-
-    Without ``mounts`` the rotations of sensors on the tool are unknown.
-    """
-    if mounts is None:
-        mounts = {sensor: MountPart(session.sensors[sensor]) for sensor in session.on_tool}
-    state = {'correction': session.correction, 'accuracy_option': session.accuracy_option}
-    hashes = (result_sha256, session.observations_sha256)
-    return written(described, session.urdf, made_by, hashes, state, session.controller, mounts)
+    described = replace(described, mounts=mounts_of(result, described.model))
+    return written(described, result.session, 'fit', result_sha256)
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
@@ -388,7 +335,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
             if row['identifiable']:
                 row[f'std_if_exactly_drawn_{row["unit"]}'] = row[f'std_{row["unit"]}']
                 row |= off_drawing
-    return schemas.checked(content, schemas.Fit)
+    return checked(content, schemas.Fit)
 
 
 def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
@@ -450,9 +397,7 @@ def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
     return read_result(Path(path), schemas.Fit, schemas.FIT_FORMAT, FIT_FILE, 'fit')
 
 
-def read_result(
-    path: Path, schema: type[schemas.Content], form: str, name: str, verb: str
-) -> schemas.Content:
+def read_result(path: Path, schema: type[Record], form: str, name: str, verb: str) -> Record:
     """Read the file `name` that the command `verb` wrote, and check its format and schema.
 
     Raises InputError if it is damaged, of another format, or lacks a key.

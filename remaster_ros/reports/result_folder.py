@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE, exports
 from remaster_ros.compensation.file import COMPENSATION_FILE
 from remaster_ros.errors import InputError
-from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
     FIT_FILE,
@@ -35,6 +34,7 @@ from remaster_ros.reports.rows_csv import (
 )
 from remaster_ros.reports.sentences import std_remark
 from remaster_ros.session.files import make_folder, write_atomically, writing
+from remaster_ros.session.json_records import encoded
 
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
@@ -101,7 +101,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
     """
     folder = Path(folder)
     make_folder(folder)
-    text = schemas.encode(fit_content(result))
+    text = encoded(fit_content(result))
     write_atomically(folder / FIT_FILE, text)
     result_sha256 = hashlib.sha256(text).hexdigest()
     write_atomically(folder / RESIDUALS_FILE, residuals_text(result))
@@ -149,7 +149,7 @@ def save_discovery(
     make_folder(folder)
     predictions = predictions_of(discovery)
     content = discovery_content(discovery, confirmation, predictions, decided)
-    text = schemas.encode(content)
+    text = encoded(content)
     write_atomically(folder / DISCOVERY_FILE, text)
     result_sha256 = hashlib.sha256(text).hexdigest()
     gross = {observation for observation, _ in discovery.fit.left_out}

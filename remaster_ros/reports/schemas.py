@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-import msgspec
-import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.identifiability import GaugeDirection
 from remaster_ros.calibration.predictions import Coverage
+from remaster_ros.calibration.records import Marker, Registration, Robot, Triple
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.explain import FoundEffect, SearchRecord
@@ -28,19 +27,6 @@ from remaster_ros.kinematics.serial_chain import LEVER_M
 
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
-
-Triple = tuple[float, float, float]
-Content = TypeVar('Content', bound=Struct)
-
-
-class Robot(Struct):
-    """Arm to which the offsets belong."""
-
-    name: str
-    urdf_sha256: str
-    joint_names: list[str]
-    base_link: str
-    tip_link: str
 
 
 class Counts(Struct):
@@ -105,28 +91,6 @@ class JointOffset(Struct):
         if std is UNSET:
             return self.mean_and_std[1]
         return 1e-3 * float(std) if self.unit == 'mm' else math.radians(std)
-
-
-class Registration(Struct):
-    """T_R_N: the sensor's frame N in the robot base R.
-
-    ``std_is_lower_limit`` is true if errors remain that the model does not have: they move
-    registrations and markers by more than the std, by an unknown amount.
-    """
-
-    translation_m: Triple
-    rotation_xyzw: tuple[float, float, float, float]
-    std_m: Triple
-    std_rad: Triple
-    std_is_lower_limit: bool | UnsetType = UNSET
-
-
-class Marker(Struct):
-    """Position of a marker in the tool frame T; ``std_is_lower_limit`` as in `Registration`."""
-
-    position_m: Triple
-    std_m: Triple
-    std_is_lower_limit: bool | UnsetType = UNSET
 
 
 class Noise(Struct):
@@ -366,28 +330,6 @@ class Fit(Struct):
     orientation: Orientation | UnsetType = UNSET
     clocks: dict[str, Clock] | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET
-
-
-def checked(content: Mapping[str, Any], schema: type[Content]) -> Content:
-    """Content by its schema: arrays as lists, NaN as None, unknown keys dropped."""
-    return msgspec.json.decode(msgspec.json.encode(content, enc_hook=_plain), type=schema)
-
-
-def _plain(values: Any) -> Any:
-    """Array as nested lists, mapping as a dict (not deeper), for a JSON encoder.
-
-    Raises TypeError for other types.
-    """
-    if isinstance(values, np.ndarray | np.generic):
-        return values.tolist()
-    if isinstance(values, Mapping):
-        return dict(values)
-    raise TypeError(f'no JSON for {type(values)}')
-
-
-def encode(content: Struct) -> bytes:
-    """Bytes of a file, indented."""
-    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
 
 
 class Loadable(Struct):

@@ -17,11 +17,12 @@ from worlds.hidden_sessions import HiddenSession, Recipe, hidden_session, third_
 
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
+from remaster_ros.compensation.file import written
 from remaster_ros.compensation.of_result import arm_of_effects, arm_of_geometry, arm_of_offsets
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse
 from remaster_ros.reports.discovery_json import compensation_of, holds_everything, predictions_of
-from remaster_ros.reports.fit_json import correction_text, geometry_of
+from remaster_ros.reports.fit_json import geometry_of
 from remaster_ros.reports.result_folder import save_discovery, save_fit
 from remaster_ros.types import Correction
 
@@ -148,7 +149,7 @@ def test_offsets_alone_err_by_what_the_arm_with_lengths_and_tilts_has_elsewhere(
     bare = Compensator(arm_of_offsets(fit, 1.0).model).uncertainty(q)
     assert np.trace(found, axis1=1, axis2=2).mean() > 1.2 * np.trace(bare, axis1=1, axis2=2).mean()
     path = tmp_path / 'compensation.json'
-    path.write_text(correction_text(alone, fit.session, 'fit', ''), encoding='utf-8')
+    path.write_text(written(alone, fit.session, 'fit', ''), encoding='utf-8')
     file = remaster_ros.read_compensation(path)
     np.testing.assert_allclose(file.uncertainty(q), found, rtol=1e-4, atol=1e-18)
     # Of the offsets themselves the covariance stays what it is.

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -41,5 +43,16 @@ def save(
         replace(model, root=root), identifiable, why, np.tile([-2.0, 2.0], (k, 1))
     )
     path = folder / 'compensation.json'
-    path.write_text(written(described, urdf, 'fit', ('', ''), {}, controller), encoding='utf-8')
+    session = SimpleNamespace(
+        urdf=urdf,
+        urdf_sha256=hashlib.sha256(urdf.encode()).hexdigest(),
+        base_link=model.chain.base_link,
+        tip_link=model.chain.tip_link,
+        observations_sha256='',
+        correction=None,
+        accuracy_option='',
+        controller=controller,
+        on_tool=(),
+    )
+    path.write_text(written(described, session, 'fit', ''), encoding='utf-8')
     return path

@@ -12,12 +12,13 @@ from types import SimpleNamespace
 import numpy as np
 from worlds.played_collection import CHAIN
 
+from remaster_ros.calibration.records import Marker
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import watch
 from remaster_ros.nodes.planner.pose_publisher import PosePublisher
 from remaster_ros.nodes.watch import fit_facts
 from remaster_ros.reports.live_view import FitFacts
-from remaster_ros.reports.schemas import Accuracy, JointOffset, Marker
+from remaster_ros.reports.schemas import Accuracy, JointOffset
 
 
 def errors(before, after):

@@ -11,8 +11,8 @@ from hostile.files import check_read, read_urdf, spoil_and_read
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import MOST_LINKS, parse_urdf
-from remaster_ros.reports import schemas
 from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
+from remaster_ros.session.json_records import encoded
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.session.strict_yaml import YamlError, load_yaml
 from remaster_ros.session.workcell import read_cell
@@ -50,7 +50,7 @@ def test_a_spoilt_file_is_read_or_refused(session, fit_result, tmp_path, rng, na
     for part in ('robots', 'cells'):
         shutil.copytree(CONFIG / part, tmp_path / part)
     path, fit = tmp_path / name, tmp_path / 'fit.json'
-    fit.write_bytes(schemas.encode(fit_content(fit_result)))
+    fit.write_bytes(encoded(fit_content(fit_result)))
     readers = {
         'session': lambda: read_session(folder),
         'robots': lambda: read_urdf(path),
