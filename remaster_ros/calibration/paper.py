@@ -10,9 +10,10 @@ both.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec import structs
 
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.grouped_rows import Rows
@@ -202,7 +203,7 @@ def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
                 'nothing: its prior is flat and the chain wanders along it (registrations and '
                 f'markers are given for {old})'
             )
-        directions.append(replace(direction, fixed_by=new))
+        directions.append(structs.replace(direction, fixed_by=new))
         why = [text.replace(f'fixed by {old}', f'fixed by {new}') for text in why]
     return Gauge(tuple(directions), gauge.held, tuple(why))
 
