@@ -62,8 +62,8 @@ def one_size(n: int) -> dict[str, float]:
         'cpu': cpu,
         'gib': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2,
         'error': float(np.sqrt(np.mean(error**2))),
-        'effective': float(min(result.sampler.ess_bulk.min(), result.sampler.ess_tail.min())),
-        'r_hat': float(result.sampler.r_hat.max()),
+        'effective': result.sampler.ess_min,
+        'r_hat': result.sampler.r_hat_max,
     }
 
 

@@ -138,7 +138,7 @@ def _chain(fit: FitResult | None, joint: int) -> str:
 
 
 def _r_hat(fit: FitResult, joint: int) -> float:
-    return float(fit.sampler.r_hat[fit.parameter_names.index(fit.joint_names[joint])])
+    return float(fit.diagnostics.r_hat[fit.parameter_names.index(fit.joint_names[joint])])
 
 
 def table_ii(cases: Cases, chains: Mapping[str, FitResult]) -> Iterator[str]:
@@ -168,7 +168,8 @@ def table_ii(cases: Cases, chains: Mapping[str, FitResult]) -> Iterator[str]:
     yield '## Table II: corrections of the registration, and the noise'
     yield table(('parameter', 'sensor', 'paper', *NOISES.values()), rows)
     worst = '; '.join(
-        f'{SENSORS[sensor]} {np.nanmax(fit.sampler.r_hat):.1f}' for sensor, fit in chains.items()
+        f'{SENSORS[sensor]} {np.nanmax(fit.diagnostics.r_hat):.1f}'
+        for sensor, fit in chains.items()
     )
     yield note('II', worst=worst or 'not run')
 

@@ -10,10 +10,11 @@ separate quantity. The diagnostics of a constant quantity are NaN.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
+from msgspec import Struct
 
 from remaster_ros.calibration.metropolis import Chains, Method
 from remaster_ros.errors import InsufficientDataError
@@ -137,67 +138,82 @@ def _effective(draws: FloatArray) -> FloatArray:
     return np.where(moves, c * n / time, float(c * n))
 
 
-@dataclass(frozen=True, eq=False)
-class SamplerInfo:
-    """Method of sampling, and diagnostics of its draws."""
+class Diagnostics(NamedTuple):
+    """Diagnostics of the draws of each of p parameters, (p,); no R-hat (NaN) without chains."""
+
+    r_hat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+
+    @classmethod
+    def of(cls, run: Chains) -> Diagnostics:
+        """Diagnostics of the draws of a sampler."""
+        if run.method == 'metropolis':
+            draws = run.draws
+            return cls(*(run.figures or (r_hat(draws), ess_bulk(draws), ess_tail(draws))))
+        p = run.draws.shape[2]
+        return cls(np.full(p, np.nan), *np.full((2, p), run.effective))
+
+
+class SamplerInfo(Struct, frozen=True):
+    """Method of sampling, and how far its draws are to be trusted, as fit.json has it."""
 
     name: str  # Name of the sampler, for the report
     # Number of chains, and of draws kept in each
     chains: int
     draws: int
-    acceptance_rate: float  # Share of accepted proposals
-    # Diagnostics of each parameter of `FitResult.parameter_names`, (p,)
-    r_hat: FloatArray
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    # Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
-    # requested; None if a number of draws was requested instead
-    precision: float
-    precision_wanted: float | None
-    seconds: float  # Time by the clock passed in; NaN without one
+    # Largest R-hat, and least effective sample size, over all parameters; None: not known
+    r_hat_max: float | None
+    ess_min: float | None
+    seconds: float | None  # Time by the clock passed in; None without one
+    # What has a default is missing in files of others. Share of accepted proposals
+    acceptance_rate: float | None = None
     # Whether each R-hat is at most 1.01 and each effective sample size at least that of the
     # requested precision (400 without one). True for a Gaussian about the mode if there are too
     # many parameters to sample; false if chains were given up
-    converged: bool
-    message: str  # Verdict with its figures, for the appendix of the report
+    converged: bool = False
+    message: str = ''  # Verdict with its figures, for the appendix of the report
+    # Largest Monte Carlo error of a mean over its parameter's standard deviation, reached and
+    # requested; None if a number of draws was requested instead
+    precision: float | None = None
+    precision_wanted: float | None = None
     method: Method = 'metropolis'  # 'laplace' has no R-hat
-    # If chains were given up: tail shape of the proposals' importance weights; NaN otherwise
-    pareto_k: float = float('nan')
+    # If chains were given up: tail shape of the proposals' importance weights; None otherwise
+    pareto_k: float | None = None
 
     @property
     def wandering(self) -> bool:
         """Whether chains disagree, or have too few effective draws to judge."""
         if self.method != 'metropolis':
             return False
-        few = np.min((self.ess_bulk, self.ess_tail)) < ESS_LIMIT
-        return bool(few or np.max(self.r_hat) > R_HAT_LIMIT)
+        few = self.ess_min is not None and self.ess_min < ESS_LIMIT
+        return few or (self.r_hat_max is not None and self.r_hat_max > R_HAT_LIMIT)
 
     @classmethod
     def of(
         cls,
         run: Chains,
+        diagnostics: Diagnostics,
         names: Sequence[str],
         *,
         name: str,
         wanted: float | None,
-        seconds: float,
+        seconds: float | None,
         weakest: str = '',
     ) -> SamplerInfo:
-        """Diagnostics of the draws of p named parameters; arguments as the attributes.
+        """Convergence of the draws of p named parameters; arguments as the attributes.
 
         ``weakest`` names the parameters that the observations determine worst together.
         """
-        draws = run.draws
         needed = ESS_LIMIT if wanted is None else wanted**-2
+        least = float(np.min(diagnostics[1:]))
+        chains, draws = run.draws.shape[:2]
         if run.method == 'metropolis':
-            figures = run.figures or (r_hat(draws), ess_bulk(draws), ess_tail(draws))
-            worst, least = float(np.max(figures[0])), float(np.min(figures[1:]))
+            worst = float(np.max(diagnostics.r_hat))
             sound = worst <= R_HAT_LIMIT
-            agreement = f'R-hat up to {worst:.3f} ({names[int(np.argmax(figures[0]))]})'
+            agreement = f'R-hat up to {worst:.3f} ({names[int(np.argmax(diagnostics.r_hat))]})'
         else:
-            least = run.effective
-            figures = (np.full(len(names), np.nan), *np.full((2, len(names)), least))
-            sound = bool(np.isnan(run.pareto_k))
+            worst, sound = np.nan, bool(np.isnan(run.pareto_k))
             agreement = (
                 f'a Gaussian about the mode of {len(names)} parameters, which nothing has checked'
             )
@@ -209,7 +225,7 @@ class SamplerInfo:
         precision = float(1.0 / np.sqrt(least))
         message = 'converged' if converged else 'NOT converged'
         if not converged and wanted is not None and run.method == 'metropolis':
-            message += f' within {draws.shape[1]} draws a chain'
+            message += f' within {draws} draws a chain'
         message += (
             f': {agreement}, at least {least:.0f} effective draws, every mean within '
             f'{100 * precision:.1f} % of its standard deviation'
@@ -220,15 +236,21 @@ class SamplerInfo:
             message += f'; the observations hardly determine {weakest}'
         return cls(
             name,
-            draws.shape[0],
-            draws.shape[1],
-            run.acceptance_rate,
-            *figures,
-            precision,
-            wanted,
+            chains,
+            draws,
+            _known(worst),
+            _known(least),
             seconds,
+            run.acceptance_rate,
             converged,
             message,
+            precision,
+            wanted,
             run.method,
-            run.pareto_k,
+            _known(run.pareto_k),
         )
+
+
+def _known(figure: float) -> float | None:
+    """Figure; None for NaN."""
+    return None if np.isnan(figure) else figure

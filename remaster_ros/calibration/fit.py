@@ -136,7 +136,7 @@ def fit_session(
         sampled = _fast(found, chains, draws, precision, rng, report)
         if unmodelled is not None:
             sampled = replace(sampled, unmodelled=unmodelled)
-    seconds = clock() - started if clock is not None else np.nan
+    seconds = clock() - started if clock is not None else None
     result = build_result(problem, sampled, seconds, rng)
     if extension is None:
         # What cannot be compared is said now.

@@ -7,30 +7,55 @@ Noise of orientations has the same form, under the names of `Posterior.noise_nam
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.calibration.posterior import Posterior
 from remaster_ros.types import FloatArray
 
 
-@dataclass(frozen=True)
-class NoiseEstimate:
+class NoiseEstimate(Struct, frozen=True):
     """Noise of one sensor per axis, m: posterior means, and the standard deviation of ``sigma_m``.
 
     ``pose_sigma_m`` is None if no pose has two frames: ``sigma_m`` then holds both parts, or
-    ``frame_sigma_m`` does, the noise common to the markers of a frame; it is None if no frame has
+    ``frame_sigma_m`` does, the noise common to the markers of a frame; it is unset if no frame has
     two markers. If the noise along the line of sight differs, these are root mean squares over the
-    three axes, and ``directions`` has the noise 'along' and 'across'; otherwise it is empty.
+    three axes, and that along and across it is given as well.
     """
 
     sigma_m: float
     std_m: float
     pose_sigma_m: float | None
-    pose_std_m: float | None
-    frame_sigma_m: float | None = None
-    frame_std_m: float | None = None
-    directions: Mapping[str, NoiseEstimate] = field(default_factory=dict)
+    pose_std_m: float | UnsetType | None = UNSET
+    frame_sigma_m: float | UnsetType = UNSET
+    frame_std_m: float | UnsetType = UNSET
+    along_sigma_m: float | UnsetType = UNSET
+    along_std_m: float | UnsetType = UNSET
+    along_pose_sigma_m: float | UnsetType | None = UNSET
+    along_pose_std_m: float | UnsetType | None = UNSET
+    along_frame_sigma_m: float | UnsetType = UNSET
+    along_frame_std_m: float | UnsetType = UNSET
+    across_sigma_m: float | UnsetType = UNSET
+    across_std_m: float | UnsetType = UNSET
+    across_pose_sigma_m: float | UnsetType | None = UNSET
+    across_pose_std_m: float | UnsetType | None = UNSET
+    across_frame_sigma_m: float | UnsetType = UNSET
+    across_frame_std_m: float | UnsetType = UNSET
+
+    @property
+    def directions(self) -> Mapping[str, NoiseEstimate]:
+        """Noise 'along' and 'across' the line of sight; {} if they do not differ."""
+        if self.along_sigma_m is UNSET:
+            return {}
+        return {
+            direction: NoiseEstimate(*(getattr(self, f'{direction}_{key}') for key in KEYS))
+            for direction in ('along', 'across')
+        }
+
+
+KEYS = NoiseEstimate.__struct_fields__[:6]
 
 
 def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
@@ -40,24 +65,24 @@ def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseE
     separate = {noise_model.channels[index].sensor for index in noise_model.separable}
     framed = {noise_model.channels[index].sensor for index in noise_model.framed}
 
-    def of_draws(draws: FloatArray, known: bool) -> tuple[float, float] | tuple[None, None]:
-        return (float(draws.mean()), float(draws.std(ddof=1))) if known else (None, None)
+    def of_draws(draws: FloatArray) -> tuple[float, float]:
+        return float(draws.mean()), float(draws.std(ddof=1))
 
     def estimate(noise: Noise, at: int, sensor: int) -> NoiseEstimate:
-        sigma = noise.sigma[..., at]
+        pose, frame = noise.pose_sigma[..., at], noise.frame_sigma[..., at]
         return NoiseEstimate(
-            float(sigma.mean()),
-            float(sigma.std(ddof=1)),
-            *of_draws(noise.pose_sigma[..., at], sensor in separate),
-            *of_draws(noise.frame_sigma[..., at], sensor in framed),
+            *of_draws(noise.sigma[..., at]),
+            *(of_draws(pose) if sensor in separate else (None, None)),
+            *(of_draws(frame) if sensor in framed else (UNSET, UNSET)),
         )
 
     result = {}
     for sensor, name in enumerate(posterior.noise_names):
         directions = {
-            channel.direction: estimate(by_channel, index, sensor)
+            f'{channel.direction}_{key}': getattr(estimate(by_channel, index, sensor), key)
             for index, channel in enumerate(noise_model.channels)
             if channel.sensor == sensor and channel.direction
+            for key in KEYS
         }
-        result[name] = replace(estimate(by_sensor, sensor, sensor), directions=directions)
+        result[name] = replace(estimate(by_sensor, sensor, sensor), **directions)
     return result

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
+from msgspec import Struct
 
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.laplace import Mode
@@ -59,9 +60,8 @@ OF_THE_ARM = ('joint_angle', 'joint_time', 'link', 'axis')
 LEAST_NOISE_M = 1e-6
 
 
-@dataclass(frozen=True)
-class StructureTest:
-    """One test of the residuals."""
+class StructureTest(Struct, frozen=True):
+    """One test of the residuals, as fit.json has it."""
 
     # What the residuals were compared with: 'position', 'time', 'joint_angle', zero-offsets by
     # 'joint_time', displacements of a 'link' and tilts of an 'axis' that are constant in their
@@ -73,6 +73,7 @@ class StructureTest:
     sensor: str = ''  # Name of the sensor; '' for all sensors
     # For 'held_out': ratio of the typical errors, each in units of its standard deviation
     ratio: float | None = None
+    found: bool = False  # Whether it is significant among all tests; set when it is written
 
     @property
     def chance(self) -> str:

@@ -13,7 +13,7 @@ import scipy
 from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
-from remaster_ros.calibration.convergence import SamplerInfo
+from remaster_ros.calibration.convergence import Diagnostics, SamplerInfo
 from remaster_ros.calibration.dynamics import clocks_of
 from remaster_ros.calibration.estimate import Estimate, Problem
 from remaster_ros.calibration.gauge_words import the
@@ -275,6 +275,7 @@ class FitResult:
     marker_std_m: Mapping[str, FloatArray]
     noise: Mapping[str, NoiseEstimate]
     sampler: SamplerInfo
+    diagnostics: Diagnostics
     residuals_after: FloatArray
     compare: Callable[[], Comparison]
     left_out: tuple[tuple[int, str], ...]
@@ -437,7 +438,7 @@ def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
 
 
 def build_result(
-    problem: Problem, sampled: Sampled, seconds: float, rng: np.random.Generator
+    problem: Problem, sampled: Sampled, seconds: float | None, rng: np.random.Generator
 ) -> FitResult:
     """Summary of the draws; ``seconds``: their computing time; ``rng``: for section V-C."""
     posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
@@ -499,7 +500,7 @@ def build_result(
         draws=by_data.z.reshape(-1, model.size),
         sigma=total_noise.reshape(-1, *total_noise.shape[2:]),
     )
-    names = _sampled_names(posterior, sampled.moved)
+    names, diagnostics = _sampled_names(posterior, sampled.moved), Diagnostics.of(sampled.run)
 
     def by_sensor(values: FloatArray) -> dict[str, FloatArray]:
         return dict(zip(problem.sensor_names, values, strict=True))
@@ -540,12 +541,14 @@ def build_result(
         orientations=_orientations(posterior, sampled, information, x_after, x_draws),
         sampler=SamplerInfo.of(
             sampled.run,
+            diagnostics,
             names,
             name=sampled.name,
             wanted=sampled.precision,
             seconds=seconds,
             weakest='' if sampled.mode is None else sampled.mode.weakest,
         ),
+        diagnostics=diagnostics,
         residuals_after=residuals_after,
         compare=compare,
         left_out=tuple(zip(left_out.tolist(), (why for _, why in sampled.left_out), strict=True)),

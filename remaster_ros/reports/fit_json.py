@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 from remaster_ros.calibration.predictions import predict
 from remaster_ros.calibration.priors import DRAWING_TAILS
@@ -46,7 +46,6 @@ from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
 if TYPE_CHECKING:
-    from remaster_ros.calibration.noise_estimate import NoiseEstimate
     from remaster_ros.calibration.result import FitResult, Orientations
 
 FIT_FILE = 'fit.json'
@@ -63,7 +62,7 @@ def estimates(result: FitResult) -> dict[str, Any]:
 
     Keys: robot, session, joint_offsets, registration, markers, noise, sampler.
     """
-    session, sampler = result.session, result.sampler
+    session = result.session
     limits = {'std_is_lower_limit': True} if result.other_errors else {}
     return {
         'robot': Robot.of(session, result.chain),
@@ -83,12 +82,8 @@ def estimates(result: FitResult) -> dict[str, Any]:
             name: {'position_m': position, 'std_m': result.marker_std_m[name], **limits}
             for name, position in result.marker_positions.items()
         },
-        'noise': {sensor: _noise(noise) for sensor, noise in result.noise.items()},
-        'sampler': {
-            **vars(sampler),
-            'r_hat_max': np.max(sampler.r_hat),
-            'ess_min': np.min((sampler.ess_bulk, sampler.ess_tail)),
-        },
+        'noise': result.noise,
+        'sampler': result.sampler,
     }
 
 
@@ -281,7 +276,7 @@ def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
 
 def fit_content(result: FitResult) -> schemas.Fit:
     """Content of fit.json."""
-    draws, sampler = result.draws.reshape(-1, result.draws.shape[-1]), result.sampler
+    draws = result.draws.reshape(-1, result.draws.shape[-1])
     content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,
         'version': __version__,
@@ -291,9 +286,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
             name=result.parameter_names,
             mean=draws.mean(axis=0),
             std=draws.std(axis=0, ddof=1),
-            r_hat=sampler.r_hat,
-            ess_bulk=sampler.ess_bulk,
-            ess_tail=sampler.ess_tail,
+            **result.diagnostics._asdict(),
         ),
         'accuracy': result.accuracy,
         'left_out': [{'observation': row, 'why': why} for row, why in result.left_out],
@@ -312,10 +305,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
     }
     if result.structure is not None:
         content['residual_structure'] = [
-            {
-                **{name: value for name, value in vars(test).items() if value not in ('', None)},
-                'found': test in result.structure.found,
-            }
+            structs.replace(test, found=test in result.structure.found)
             for test in result.structure.tests
         ]
         content['intervals'] = 'robust' if result.other_errors else 'model'
@@ -348,21 +338,6 @@ def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
 def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
     """Rows of equally long columns."""
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-
-
-def _noise(noise: NoiseEstimate) -> dict[str, Any]:
-    """Noise of a sensor, without keys of frame noise that it does not have."""
-    directions = {
-        f'{direction}_{key}': value
-        for direction, part in noise.directions.items()
-        for key, value in vars(part).items()
-    }
-    return {
-        key: value
-        for key, value in (vars(noise) | directions).items()
-        # A sensor with one marker in a frame has no such noise.
-        if value is not None or 'frame' not in key
-    }
 
 
 def _describe(session: Session) -> dict[str, Any]:

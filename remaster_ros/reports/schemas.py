@@ -14,9 +14,12 @@ from typing import Any, Literal
 
 from msgspec import UNSET, Struct, UnsetType
 
+from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.identifiability import GaugeDirection
+from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.records import Marker, Registration, Robot, Triple
+from remaster_ros.calibration.residual_structure import StructureTest
 from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.explain import FoundEffect, SearchRecord
@@ -91,56 +94,6 @@ class JointOffset(Struct):
         if std is UNSET:
             return self.mean_and_std[1]
         return 1e-3 * float(std) if self.unit == 'mm' else math.radians(std)
-
-
-class Noise(Struct):
-    """Noise of a sensor per axis: of one row, and shared by a pose (None: not separable).
-
-    If it has several markers in a frame, also the noise that these share. If it differs along and
-    across the line of sight, both are given as well.
-    """
-
-    sigma_m: float
-    std_m: float
-    pose_sigma_m: float | None
-    pose_std_m: float | UnsetType | None = UNSET
-    frame_sigma_m: float | UnsetType = UNSET
-    frame_std_m: float | UnsetType = UNSET
-    along_sigma_m: float | UnsetType = UNSET
-    along_std_m: float | UnsetType = UNSET
-    along_pose_sigma_m: float | UnsetType | None = UNSET
-    along_pose_std_m: float | UnsetType | None = UNSET
-    along_frame_sigma_m: float | UnsetType = UNSET
-    along_frame_std_m: float | UnsetType = UNSET
-    across_sigma_m: float | UnsetType = UNSET
-    across_std_m: float | UnsetType = UNSET
-    across_pose_sigma_m: float | UnsetType | None = UNSET
-    across_pose_std_m: float | UnsetType | None = UNSET
-    across_frame_sigma_m: float | UnsetType = UNSET
-    across_frame_std_m: float | UnsetType = UNSET
-
-
-class Sampler(Struct):
-    """Sampling of the posterior; ``draws`` are kept draws of each chain.
-
-    ``precision`` is the Monte Carlo error of the worst mean in standard deviations; ``method`` is
-    'metropolis' for chains, 'laplace' for a Gaussian about the mode; ``pareto_k``, if chains were
-    given up, is the shape of the tail of their proposals' weights.
-    """
-
-    name: str
-    chains: int
-    draws: int
-    r_hat_max: float | None
-    ess_min: float | None
-    seconds: float | None
-    acceptance_rate: float | UnsetType | None = UNSET
-    converged: bool | UnsetType = UNSET
-    message: str | UnsetType = UNSET
-    precision: float | UnsetType | None = UNSET
-    precision_wanted: float | UnsetType | None = UNSET
-    method: Literal['metropolis', 'laplace'] | UnsetType = UNSET
-    pareto_k: float | UnsetType | None = UNSET
 
 
 class SampledParameter(Struct):
@@ -235,21 +188,6 @@ class Judgement(Struct):
     disagreements: list[str] = []
 
 
-class StructureTest(Struct):
-    """Test whether the residuals follow a driver: in the means of the poses, or within poses.
-
-    The driver 'held_out' tests whether the residuals of a ``sensor`` are larger on held-out poses
-    than on poses left out of the fit: ``ratio`` times, in units of their prediction's uncertainty.
-    """
-
-    driver: str
-    between_poses: bool
-    p_value: float
-    found: bool
-    sensor: str | UnsetType = UNSET
-    ratio: float | UnsetType = UNSET
-
-
 class Imitation(Struct):
     """Length or tilt that changes a joint's offset most: by ``deg`` if it is off by the tolerance.
 
@@ -315,8 +253,8 @@ class Fit(Struct):
     gauge: list[GaugeDirection]
     registration: dict[str, Registration]
     markers: dict[str, Marker]
-    noise: dict[str, Noise]
-    sampler: Sampler
+    noise: dict[str, NoiseEstimate]
+    sampler: SamplerInfo
     accuracy: Accuracy
     left_out: list[LeftOut]
     version: str | UnsetType = UNSET
@@ -352,7 +290,7 @@ class NoiseOfDiscovery(Struct):
     pose_common_fraction: float
     outliers: list[int]
     heteroscedastic: Mapping[str, Any]
-    sensors: dict[str, Noise] | UnsetType = UNSET
+    sensors: dict[str, NoiseEstimate] | UnsetType = UNSET
 
 
 class OffsetBefore(Struct):
@@ -408,7 +346,7 @@ class Discovered(Struct):
     unexplained: list[Unexplained] | UnsetType = UNSET
     search: SearchRecord | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
-    sampler: Sampler | UnsetType = UNSET
+    sampler: SamplerInfo | UnsetType = UNSET
     registration: dict[str, Registration] | UnsetType = UNSET
     markers: dict[str, Marker] | UnsetType = UNSET
     covariance: JointCovariance | UnsetType = UNSET

@@ -215,7 +215,8 @@ def _sampling(sampler: SamplerInfo) -> str:
 
     Its figures, such as R-hat, are in the appendix of a report.
     """
-    exact = f'every mean is exact to {100 * sampler.precision:.1f} % of its standard deviation'
+    percent_of_std = 100 * (sampler.precision or np.nan)
+    exact = f'every mean is exact to {percent_of_std:.1f} % of its standard deviation'
     if sampler.converged and sampler.method == 'metropolis':
         return f'The sampling of the offsets has converged: {exact}.'
     if sampler.converged:

@@ -87,7 +87,9 @@ def test_the_chains_agree_and_say_so(fits) -> None:
         assert info.message.startswith('converged')
         assert info.chains == 4
         assert info.acceptance_rate > 0.6
-        assert len(info.r_hat) == len(result.parameter_names) == result.draws.shape[2]
+        assert (
+            len(result.diagnostics.r_hat) == len(result.parameter_names) == result.draws.shape[2]
+        )
         assert result.joint_offset_draws.shape == (4, 1000, 7)
 
 

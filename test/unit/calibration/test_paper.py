@@ -99,7 +99,7 @@ def test_a_short_run_reports_that_it_did_not_converge() -> None:
     assert result.parameter_names[:7] == CHAIN.joint_names
     assert result.sampler.name.startswith('paper')
     assert result.sampler.message.startswith('NOT converged: R-hat up to')
-    assert result.sampler.r_hat.max() > 1.5
+    assert result.sampler.r_hat_max > 1.5
     assert not result.sampler.converged
     assert shares[-1] == pytest.approx(1.0)
     # The gauge of joint 1 is reported, with a wide interval; markers stay at nominal.

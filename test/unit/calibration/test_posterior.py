@@ -170,9 +170,9 @@ def test_what_the_length_is_judged_by_is_what_is_stated() -> None:
     fit = fit_session(scene(60, poses=12)[0], rng=np.random.default_rng(4))
     assert fit.sampler.method == 'metropolis'
     for stated, of in (
-        (fit.sampler.r_hat, convergence.r_hat),
-        (fit.sampler.ess_bulk, convergence.ess_bulk),
-        (fit.sampler.ess_tail, convergence.ess_tail),
+        (fit.diagnostics.r_hat, convergence.r_hat),
+        (fit.diagnostics.ess_bulk, convergence.ess_bulk),
+        (fit.diagnostics.ess_tail, convergence.ess_tail),
     ):
         np.testing.assert_allclose(stated, of(fit.draws), rtol=1e-9)
 
@@ -313,7 +313,7 @@ def test_a_nearly_singular_session_ends_with_its_direction_named(
     assert not sampler.wandering
     assert 'hardly determine registration.mocap.z (+1.00) and joint_2' in sampler.message
     assert f'Pareto k of the proposals {sampler.pareto_k:.2f}' in sampler.message
-    assert np.all(np.isnan(sampler.r_hat))
+    assert np.all(np.isnan(result.diagnostics.r_hat))
 
 
 @pytest.mark.qualify

@@ -531,7 +531,7 @@ def test_without_held_out_poses_nothing_found_is_not_proven(scenes, tmp_path):
 
 def test_a_posterior_that_is_only_approximate_is_never_green(scenes, tmp_path):
     fit = scenes['healthy'].fit
-    sampler = replace(fit.sampler, converged=False, method='laplace')
+    sampler = structs.replace(fit.sampler, converged=False, method='laplace')
     doubtful = replace(scenes['healthy'], fit=replace(fit, sampler=sampler))
     page, mood, _ = shown(doubtful, tmp_path, figures=False)
     assert mood == 'caution'

@@ -285,11 +285,8 @@ def test_wider_intervals_and_their_reason_are_in_the_file(fit_result):
 
 
 def test_the_approximation_and_its_check_are_in_the_file(fit_result):
-    sampler = replace(
-        fit_result.sampler,
-        method='laplace',
-        pareto_k=0.45,
-        r_hat=np.full(len(fit_result.parameter_names), np.nan),
+    sampler = msgspec.structs.replace(
+        fit_result.sampler, method='laplace', pareto_k=0.45, r_hat_max=None
     )
     content = msgspec.to_builtins(fit_content(replace(fit_result, sampler=sampler)))
     assert content['sampler']['method'] == 'laplace'

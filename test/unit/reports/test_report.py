@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from judges.html_page import Page
+from msgspec import structs
 from rigs.browser import seen
 
-from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.report import _round_factor, draw_view, fit_html
@@ -194,8 +194,9 @@ def test_a_session_without_validation_has_a_report(fit_result):
 
 def test_noise_along_the_line_of_sight_has_rows_of_its_own(fit_result):
     name = next(iter(fit_result.noise))
-    part = NoiseEstimate(0.0123e-3, 1e-6, None, None)
-    noise = replace(fit_result.noise[name], directions={'along': part, 'across': part})
+    part = {'sigma_m': 0.0123e-3, 'std_m': 1e-6, 'pose_sigma_m': None, 'pose_std_m': None}
+    sides = {f'{side}_{key}': part[key] for side in ('along', 'across') for key in part}
+    noise = structs.replace(fit_result.noise[name], **sides)
     plain = fit_html(fit_result, {})
     assert 'line of sight' not in plain
     html = fit_html(replace(fit_result, noise={**fit_result.noise, name: noise}), {})

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise_check import NoiseCheck
@@ -40,8 +41,8 @@ def with_accuracy(result, split, before, after):
     ],
 )
 def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood, words):
-    r_hat = fit_result.sampler.r_hat if converged else np.full(3, 1.2)
-    sampler = replace(fit_result.sampler, converged=converged, r_hat=r_hat)
+    r_hat_max = fit_result.sampler.r_hat_max if converged else 1.2
+    sampler = structs.replace(fit_result.sampler, converged=converged, r_hat_max=r_hat_max)
     result = replace(with_accuracy(fit_result, split, before, after), sampler=sampler)
     # The session has gross errors among its held-out rows, which alone are no good news.
     assert any(check.spoilt for check in result.noise_checks)
@@ -58,7 +59,7 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
 
 def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
     message = 'NOT converged: a Gaussian about the mode (no chain came to its end)'
-    sampler = replace(
+    sampler = structs.replace(
         fit_result.sampler, converged=False, method='laplace', pareto_k=1.4, message=message
     )
     judged = verdict(replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), sampler=sampler))
