@@ -12,9 +12,11 @@ leaves errors of any size.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
 
 from remaster_ros.calibration.noise import MEDIAN_LENGTH
 from remaster_ros.calibration.outliers import (
@@ -44,32 +46,48 @@ MEAN_LENGTH = float(np.sqrt(8.0 / np.pi))
 """Mean length of a vector of three independent standard normal numbers."""
 
 
-@dataclass(frozen=True)
-class NoiseCheck:
-    """Error after a fit at one sensor, and whether noise explains it."""
+class NoiseCheck(Struct, frozen=True):
+    """Error after a fit at one sensor, and whether noise explains it, as fit.json has it."""
 
-    sensor: str  # Name of the sensor
+    # Whether noise explains the error; None if the noise is unknown
+    explained: bool | None
     # Mean 3-D error on the rows judged, without the worst twentieth and without gross errors, m
-    error_m: float
+    after_m: float
+    noise_m: float | None  # Mean 3-D error by the reliable noise on these rows, m
     # Standard deviation per axis of a reading (RMS) by the scatter of its samples, m; None if no
     # reading has samples
-    stated_m: float | None
+    stated_std_m: float | None
     # Standard deviation per axis of the errors within poses, m; None where no pose has two
-    within_m: float | None
-    poses: int  # Number of poses judged; the mean of few may differ much from that of many
-    # Ratio of the error on held-out rows to the noise: few poses determine the parameters poorly;
-    # 1 on fitted rows
-    spread: float = 1.0
+    within_pose_std_m: float | None
     # ``observation`` of every held-out row with a single gross error: no fit leaves those out.
     # Empty if there are so many that a fit would refuse them: something changed between fitted
     # and held-out poses, or the model is wrong.
     gross: tuple[int, ...] = ()
+    sensor: str = ''  # Name of the sensor
+    poses: int = 1  # Number of poses judged; the mean of few may differ much from that of many
+    # Ratio of the error on held-out rows to the noise: few poses determine the parameters poorly;
+    # 1 on fitted rows
+    spread: float = 1.0
     mean_m: float = 0.0  # Mean 3-D error on all rows judged, gross ones too, m
+
+    @classmethod
+    def of(
+        cls, after_m: float, stated_m: float | None, within_m: float | None, **more: Any
+    ) -> Self:
+        """Comparison of an error with the noise; arguments as the attributes."""
+        check = cls(None, after_m, None, stated_m, within_m, **more)
+        std, explained = check.noise_std_m, None
+        noise_m = None if std is None else MEAN_LENGTH * check.spread * std
+        if check.is_of_no_instrument:
+            explained = False
+        elif noise_m is not None:
+            explained = bool(after_m <= MOST * check._few * noise_m)
+        return replace(check, explained=explained, noise_m=noise_m)
 
     @property
     def spoilt(self) -> str:
         """Sentence on gross errors in the held-out rows; '' if their influence is small."""
-        if not self.gross or self.mean_m <= SPOILT * self.error_m:
+        if not self.gross or self.mean_m <= SPOILT * self.after_m:
             return ''
         listed = ', '.join(map(str, self.gross[:LISTED]))
         listed += ' …' if len(self.gross) > LISTED else ''
@@ -82,33 +100,16 @@ class NoiseCheck:
         )
         return (
             f'{are} most of its mean error of {1e3 * self.mean_m:.3f} mm; without them it is '
-            f'{1e3 * self.error_m:.3f} mm. Compare the clocks of sensor and robot, and what was '
+            f'{1e3 * self.after_m:.3f} mm. Compare the clocks of sensor and robot, and what was '
             'hidden or moved then.'
         )
 
     @property
-    def noise_m(self) -> float | None:
+    def noise_std_m(self) -> float | None:
         """Reliable noise per axis, m; None if neither figure is known."""
-        if self.stated_m is None or self.within_m is None:
-            return self.stated_m if self.within_m is None else self.within_m
-        return max(self.stated_m, min(self.within_m, SCATTER * self.stated_m))
-
-    @property
-    def noise_error_m(self) -> float | None:
-        """Mean 3-D error by the reliable noise on the rows judged, m.
-
-        None if the noise is unknown.
-        """
-        return None if self.noise_m is None else MEAN_LENGTH * self.spread * self.noise_m
-
-    @property
-    def explained(self) -> bool | None:
-        """Whether noise explains the error; None if the noise is unknown."""
-        if self.is_of_no_instrument:
-            return False
-        if self.noise_error_m is None:
-            return None
-        return bool(self.error_m <= MOST * self._few * self.noise_error_m)
+        if self.stated_std_m is None or self.within_pose_std_m is None:
+            return self.stated_std_m if self.within_pose_std_m is None else self.within_pose_std_m
+        return max(self.stated_std_m, min(self.within_pose_std_m, SCATTER * self.stated_std_m))
 
     @property
     def is_of_no_instrument(self) -> bool:
@@ -117,8 +118,8 @@ class NoiseCheck:
         Last result: the sensor's samples do not show it.
         """
         most = MEAN_LENGTH * self.spread * self._few * UNCALIBRATED_ERROR_M
-        shown = self.stated_m is not None and self.stated_m >= UNCALIBRATED_ERROR_M
-        return bool(self.error_m > most) and not shown
+        shown = self.stated_std_m is not None and self.stated_std_m >= UNCALIBRATED_ERROR_M
+        return bool(self.after_m > most) and not shown
 
     @property
     def no_instrument(self) -> str:
@@ -126,7 +127,7 @@ class NoiseCheck:
         if not self.is_of_no_instrument:
             return ''
         return (
-            f'The error at {self.sensor} is {1e3 * self.error_m:.3f} mm, and no instrument that '
+            f'The error at {self.sensor} is {1e3 * self.after_m:.3f} mm, and no instrument that '
             'arms are measured with has such noise, nor do its own samples show it: an arm that '
             f'nobody has calibrated errs by {1e3 * UNCALIBRATED_ERROR_M:.0f} mm at most. Check '
             'that each point stands beside its own joints, that every marker turns with the tool '
@@ -168,15 +169,15 @@ def check_noise(
         gross = _gross(measurements, errors, held_out)
         most = len(lengths) - max(int(WORST_SHARE * len(lengths)), len(gross))
         checks.append(
-            NoiseCheck(
-                name,
+            NoiseCheck.of(
                 float(lengths[:most].mean()),
                 _stated(measurements.select(selection)),
                 _within(measurements, residuals, selection),
-                len(np.unique(measurements.pose[judged])),
-                spread if held_out.any() else 1.0,
-                gross,
-                float(lengths.mean()),
+                gross=gross,
+                sensor=name,
+                poses=len(np.unique(measurements.pose[judged])),
+                spread=spread if held_out.any() else 1.0,
+                mean_m=float(lengths.mean()),
             )
         )
     return tuple(checks)

@@ -280,19 +280,19 @@ class _Checks:
         """Entry for each error beyond the sensor's own statement, or beyond any instrument."""
         for check in self.fit.noise_checks:
             if check.is_of_no_instrument:
-                yield Unexplained('noise', 'unknown', check.error_m, None, check.no_instrument)
+                yield Unexplained('noise', 'unknown', check.after_m, None, check.no_instrument)
                 continue
-            if check.stated_m is None or check.explained is not False:
+            if check.stated_std_m is None or check.explained is not False:
                 continue
             stating = the('sensor', check.sensor)
             yield Unexplained(
                 where='noise',
                 driver='stated_std',
-                size_m=check.error_m,
+                size_m=check.after_m,
                 p_value=None,
                 next=(
-                    f'{stating[:1].upper()}{stating[1:]} states {1e3 * check.stated_m:.3f} mm per '
-                    f'axis for a reading, but the mean error is {1e3 * check.error_m:.3f} mm: '
+                    f'{stating[:1].upper()}{stating[1:]} states {1e3 * check.stated_std_m:.3f} mm '
+                    f'per axis for a reading, but the mean error is {1e3 * check.after_m:.3f} mm: '
                     'the arm does not repeat itself so well, the sensor is worse than it states, '
                     'or a cause is missing. Measure one pose twenty times, coming from elsewhere '
                     'each time.'
@@ -309,13 +309,13 @@ def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
     if len(np.unique(data.context.measurements.pose[data.rows.source])) >= FEWEST_POSES:
         return
     for check in fit.noise_checks:
-        if check.explained is not False or check.noise_error_m is None:
+        if check.explained is not False or check.noise_m is None:
             continue
-        error_mm, noise_mm = 1e3 * check.error_m, 1e3 * check.noise_error_m
+        error_mm, noise_mm = 1e3 * check.after_m, 1e3 * check.noise_m
         yield Unexplained(
             where='noise',
             driver='pose',
-            size_m=check.error_m,
+            size_m=check.after_m,
             p_value=None,
             next=(
                 f'The mean error of {the("sensor", check.sensor)} is {error_mm:.3f} mm, and what '

@@ -291,17 +291,7 @@ def fit_content(result: FitResult) -> schemas.Fit:
         'accuracy': result.accuracy,
         'left_out': [{'observation': row, 'why': why} for row, why in result.left_out],
         'judgement': msgspec.to_builtins(verdict(result)),
-        'explained_by_noise': {
-            check.sensor: {
-                'explained': check.explained,
-                'after_m': check.error_m,
-                'noise_m': check.noise_error_m,
-                'stated_std_m': check.stated_m,
-                'within_pose_std_m': check.within_m,
-                'gross': check.gross,
-            }
-            for check in result.noise_checks
-        },
+        'explained_by_noise': {check.sensor: check for check in result.noise_checks},
     }
     if result.structure is not None:
         content['residual_structure'] = [

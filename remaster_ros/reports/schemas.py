@@ -16,6 +16,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.identifiability import GaugeDirection
+from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.records import Marker, Registration, Robot, Triple
@@ -153,23 +154,6 @@ class Orientation(Struct):
     p_value: float | None = None
     std_positions_deg: dict[str, float | None] = {}
     std_positions_mm: dict[str, float | None] | UnsetType = UNSET
-
-
-class NoiseCheck(Struct):
-    """Comparison of a sensor's remaining errors with its noise.
-
-    ``after_m`` is the mean error after (of held-out rows if there are any, without the worst
-    twentieth), ``noise_m`` the error expected from the noise that the sensor states for the mean
-    of its samples, and that shows within poses (None if neither is known, as ``explained``).
-    ``gross`` has the observations of the held-out rows that are gross errors.
-    """
-
-    explained: bool | None
-    after_m: float
-    noise_m: float | None
-    stated_std_m: float | None
-    within_pose_std_m: float | None
-    gross: list[int] = []
 
 
 class Judgement(Struct):

@@ -289,7 +289,7 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
         return 'Noise does not explain what is left; so few poses do not show what does.'
     if any(check.is_of_no_instrument for check in unexplained):
         return 'But what is left is no noise of any instrument: the model does not hold.'
-    if not any(check.noise_m is not None for check in unexplained):
+    if not any(check.noise_std_m is not None for check in unexplained):
         return (
             'But what is left has structure, which noise has not: other errors dominate; '
             f'{SEARCH}.'
@@ -301,25 +301,26 @@ def _compared(check: NoiseCheck) -> str:
     """Error and noise of a sensor whose error noise does not explain, as a sentence."""
     if check.is_of_no_instrument:
         return check.no_instrument
-    if check.noise_error_m is None:
+    if check.noise_m is None:
         return (
             f'{check.sensor}: no reading has a standard deviation, and no pose was seen in two '
-            f'joint solutions, so nothing shows how much of the {1e3 * check.error_m:.3f} mm is '
+            f'joint solutions, so nothing shows how much of the {1e3 * check.after_m:.3f} mm is '
             'noise: measure poses in all their joint solutions.'
         )
     sources = [
         f'{1e3 * std:.3f} mm per axis {what}'
         for std, what in (
-            (check.stated_m, 'by the scatter of the samples of a reading'),
-            (check.within_m, 'within a pose'),
+            (check.stated_std_m, 'by the scatter of the samples of a reading'),
+            (check.within_pose_std_m, 'within a pose'),
         )
         if std is not None
     ]
-    if len(sources) > 1 and check.noise_m is not None and check.noise_m != check.within_m:
-        sources.append(f'of which {1e3 * check.noise_m:.3f} mm count')
+    std = check.noise_std_m
+    if len(sources) > 1 and std is not None and std != check.within_pose_std_m:
+        sources.append(f'of which {1e3 * std:.3f} mm count')
     return (
-        f'{check.sensor}: the error after is {1e3 * check.error_m:.3f} mm without its largest '
-        f'values; noise ({", ".join(sources)}) makes {1e3 * check.noise_error_m:.3f} mm. A '
+        f'{check.sensor}: the error after is {1e3 * check.after_m:.3f} mm without its largest '
+        f'values; noise ({", ".join(sources)}) makes {1e3 * check.noise_m:.3f} mm. A '
         'sensor or base that was moved during the session, a soft joint or a worn gear leave such '
         'errors, and the offsets take up a part of them.'
     )

@@ -61,16 +61,16 @@ def test_noise_with_a_part_common_to_the_pose_is_explained():
     """As in the source paper: 0.23 mm and 0.5 mm."""
     for seed in range(10):
         found = check(measurements(), noise(0.23e-3, 0.5e-3, seed))
-        assert found.within_m == pytest.approx(0.23e-3, rel=0.25)
-        assert found.stated_m is None
+        assert found.within_pose_std_m == pytest.approx(0.23e-3, rel=0.25)
+        assert found.stated_std_m is None
         assert found.explained, found
 
 
 def test_an_error_ten_times_the_scatter_is_not():
     moved = np.where(np.arange(POSES * EACH) < 100, 2e-3, -2e-3)[:, None] * [0.0, 1.0, 0.0]
     found = check(measurements(), noise(0.11e-3, 0.0) + moved)
-    assert found.within_m == pytest.approx(0.11e-3, rel=0.2)
-    assert found.error_m == pytest.approx(2e-3, rel=0.05)
+    assert found.within_pose_std_m == pytest.approx(0.11e-3, rel=0.2)
+    assert found.after_m == pytest.approx(2e-3, rel=0.05)
     assert not found.explained
 
 
@@ -78,7 +78,7 @@ def test_a_sensor_moved_during_one_pose_does_not_become_scatter():
     residuals = noise(0.1e-3, 0.0)
     residuals[101:] += [0.0, 4e-3, 0.0]
     found = check(measurements(), residuals)
-    assert found.within_m == pytest.approx(0.1e-3, rel=0.2)
+    assert found.within_pose_std_m == pytest.approx(0.1e-3, rel=0.2)
     assert not found.explained
 
 
@@ -88,7 +88,7 @@ def test_scatter_far_beyond_what_the_sensor_states_is_not_its_noise():
     assert check(measurements(), errors).explained
     assert not check(measurements(std_m=0.02e-3), errors).explained
     assert check(measurements(std_m=0.4e-3), errors).explained
-    assert check(measurements(std_m=0.8e-3), errors).noise_m == pytest.approx(0.8e-3, rel=0.1)
+    assert check(measurements(std_m=0.8e-3), errors).noise_std_m == pytest.approx(0.8e-3, rel=0.1)
 
 
 @pytest.mark.parametrize('samples', [1, 16, 120])
@@ -98,19 +98,20 @@ def test_the_noise_of_a_reading_is_that_of_the_mean_of_its_frames(samples):
     m = measurements(frames / np.sqrt(samples), samples=samples)
     alone = replace(m, pose=np.arange(len(m)))
     found = check(alone, noise(frames / np.sqrt(samples), 0.0))
-    assert found.stated_m == pytest.approx(frames / np.sqrt(samples))
-    assert found.noise_error_m == pytest.approx(found.error_m, rel=0.15)
+    assert found.stated_std_m == pytest.approx(frames / np.sqrt(samples))
+    assert found.noise_m == pytest.approx(found.after_m, rel=0.15)
     assert found.explained
     # Errors as large as the scatter of the frames are more than 16 or 120 frames leave.
     assert check(alone, noise(frames, 0.0)).explained == (samples == 1)
 
 
 def test_samples_that_are_not_known_count_as_one():
-    assert check(measurements(1e-4, samples=-1), noise(1e-4, 0.0)).stated_m == pytest.approx(1e-4)
+    found = check(measurements(1e-4, samples=-1), noise(1e-4, 0.0))
+    assert found.stated_std_m == pytest.approx(1e-4)
 
 
 def test_a_stated_noise_of_zero_is_none():
-    assert check(measurements(std_m=0.0), noise(0.1e-3, 0.0)).stated_m is None
+    assert check(measurements(std_m=0.0), noise(0.1e-3, 0.0)).stated_std_m is None
 
 
 def test_single_gross_errors_change_nothing_and_many_do():
@@ -137,7 +138,7 @@ def test_held_out_rows_are_judged_where_there_are_any():
     residuals[m.is_validation] += [2e-3, 0.0, 0.0]
     found = check(m, residuals)
     assert found.poses == 13
-    assert found.error_m == pytest.approx(2e-3, rel=0.05)
+    assert found.after_m == pytest.approx(2e-3, rel=0.05)
     assert found.spread == pytest.approx(np.sqrt(1.0 + 14 / (3 * 27 - 15)))
 
 
@@ -145,7 +146,7 @@ def test_without_std_and_second_solutions_nothing_tells():
     m = measurements()
     alone = replace(m, pose=np.arange(len(m)))
     found = check(alone, noise(0.1e-3, 0.0))
-    assert found.noise_m is found.noise_error_m is None
+    assert found.noise_std_m is found.noise_m is None
     assert found.explained is None
     assert check(replace(alone, std=np.full((len(m), 3), 1e-3)), noise(1e-4, 0.0)).explained
 
@@ -153,7 +154,7 @@ def test_without_std_and_second_solutions_nothing_tells():
 def test_two_markers_at_one_configuration_are_no_second_solution():
     m = measurements()
     both = replace(m, pose=np.arange(len(m)) // 2, marker=np.arange(len(m)) % 2)
-    assert check(both, noise(0.1e-3, 0.0)).within_m is None
+    assert check(both, noise(0.1e-3, 0.0)).within_pose_std_m is None
 
 
 def test_every_sensor_is_judged_by_its_own_noise():

@@ -50,7 +50,7 @@ def test_what_is_left_is_the_noise_of_the_readings():
     for rows in (held_out, ~held_out):
         assert np.std(result.residuals_after[rows]) == pytest.approx(noise, rel=0.15)
     for check in result.noise_checks:
-        assert check.within_m == pytest.approx(SIGMA_M, rel=0.2)
+        assert check.within_pose_std_m == pytest.approx(SIGMA_M, rel=0.2)
     # What the posterior predicts is what is measured.
     metrics = result.accuracy['validation']
     measured, predicted = (

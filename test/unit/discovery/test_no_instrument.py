@@ -50,7 +50,7 @@ def fitted() -> FitResult:
 
 def test_a_fit_tells_that_its_model_does_not_hold(fitted):
     (check,) = fitted.noise_checks
-    assert check.error_m > 0.02
+    assert check.after_m > 0.02
     assert check.explained is False
     assert fit_content(fitted).explained_by_noise['mocap'].explained is False
     judged = verdict(fitted)
@@ -68,7 +68,7 @@ def test_a_search_is_not_green(fitted):
 
 
 def check(error_m: float, stated_m: float | None = None, within_m: float | None = None):
-    return NoiseCheck('mocap', error_m, stated_m, within_m, poses=25)
+    return NoiseCheck.of(error_m, stated_m, within_m, sensor='mocap', poses=25)
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     # The session has gross errors among its held-out rows, which alone are no good news.
     assert any(check.spoilt for check in result.noise_checks)
     assert verdict(result).mood != 'good'
-    checks = tuple(replace(check, gross=()) for check in result.noise_checks)
+    checks = tuple(structs.replace(check, gross=()) for check in result.noise_checks)
     result = replace(result, noise_checks=checks)
     judged = verdict(result)
     assert judged.mood == mood
@@ -111,8 +111,8 @@ def test_too_few_poses_to_show_other_errors_are_never_green(fit_result):
     )
 
 
-MOVED = NoiseCheck('tracker', 2.337e-3, None, 0.11e-3, poses=12)
-UNTOLD = NoiseCheck('tracker', 0.3e-3, None, None, poses=12)
+MOVED = NoiseCheck.of(2.337e-3, None, 0.11e-3, sensor='tracker', poses=12)
+UNTOLD = NoiseCheck.of(0.3e-3, None, None, sensor='tracker', poses=12)
 
 
 @pytest.mark.parametrize('after', [2.337, 4.3])
@@ -136,7 +136,7 @@ def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, 
 
 def test_offsets_that_hardly_matter_where_noise_explains_the_rest(fit_result):
     assert all(check.explained for check in fit_result.noise_checks)
-    checks = tuple(replace(check, gross=()) for check in fit_result.noise_checks)
+    checks = tuple(structs.replace(check, gross=()) for check in fit_result.noise_checks)
     result = with_accuracy(fit_result, 'validation', 0.4, 0.39)
     judged = verdict(replace(result, noise_checks=checks))
     assert judged.mood == 'caution'
@@ -208,7 +208,7 @@ def test_where_poses_are_too_few_no_other_errors_are_said_to_dominate(fit_result
 
 def test_the_mean_without_the_largest_errors_is_said_to_be_that(fit_result):
     """It stands beside the mean of all; and of scatter within poses not all counts as noise."""
-    check = NoiseCheck('tracker', 0.934e-3, 6e-6, 0.89e-3, poses=200)
+    check = NoiseCheck.of(0.934e-3, 6e-6, 0.89e-3, sensor='tracker', poses=200)
     result = replace(with_accuracy(fit_result, 'validation', 1.0, 0.979), noise_checks=(check,))
     told = verdict(result).findings[0]
     assert 'the error after is 0.934 mm without its largest values' in told
