@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from enum import StrEnum
 from pathlib import Path
 
 from remaster_ros.motion.states import ARM, Arm, Event, Then
@@ -24,39 +22,34 @@ LEAVES = {
 
 
 def drawing() -> str:
-    """Return what an arm does when nothing halts it, as a diagram."""
-    ways: dict[tuple[Arm, Arm], list[str]] = {}
-    for state, rows in ARM.items():
-        for event, then in rows.items():
-            if then.state is not state and not {state, then.state} & {Arm.HALTS, Arm.HALTED}:
-                ways.setdefault((state, then.state), []).append(event)
-    lines = [
-        f'    {state} --> {then}: {" / ".join(events)}' for (state, then), events in ways.items()
-    ]
+    """Return the ways between the states of an arm that nothing halts, as a diagram."""
+    ways = {
+        (state, then.state): None
+        for state, rows in ARM.items()
+        for then in rows.values()
+        if then.state is not state and not {state, then.state} & {Arm.HALTS, Arm.HALTED}
+    }
+    lines = [f'    {state} --> {then}' for state, then in ways]
     return '\n'.join(['```mermaid', 'stateDiagram-v2', f'    [*] --> {Arm.STANDS}', *lines, '```'])
 
 
-def table(events: Sequence[StrEnum], cells: Mapping[StrEnum, Mapping[StrEnum, str]]) -> str:
-    """Return what follows from each event (rows) in each state (columns)."""
-    lines = [
-        f'| | {" | ".join(cells)} |',
-        '|---|' + '---|' * len(cells),
-        *(
-            f'| {event} | {" | ".join(rows.get(event, "") for rows in cells.values())} |'
-            for event in events
-        ),
-    ]
+def table() -> str:
+    """Return each event with the states in which it can happen, and what follows there."""
+    lines = ['| event | state → next state: what leaves the bridge |', '|---|---|']
+    for event in Event:
+        states: dict[str, list[Arm]] = {}
+        for state, rows in ARM.items():
+            if event in rows:
+                states.setdefault(_outcome(state, rows[event]), []).append(state)
+        if states:
+            cells = (f'{", ".join(from_)} {outcome}' for outcome, from_ in states.items())
+            lines.append(f'| {event} | {"; ".join(cells)} |')
     return '\n'.join(lines)
 
 
 def states() -> str:
     """Return the part of the page."""
-    arm = {
-        state: {event: _cell(state, then) for event, then in rows.items()}
-        for state, rows in ARM.items()
-    }
-    words = [event for event in Event if any(event in rows for rows in ARM.values())]
-    return '\n\n'.join((drawing(), table(words, arm)))
+    return '\n\n'.join((drawing(), table()))
 
 
 def page(text: str) -> str:
@@ -65,9 +58,9 @@ def page(text: str) -> str:
     return f'{before}{BEGIN}\n\n{states()}\n\n{END}{rest.split(END)[1]}'
 
 
-def _cell(state: Arm, then: Then) -> str:
+def _outcome(state: Arm, then: Then) -> str:
     out = ', '.join(LEAVES[action.__name__] for action in then.actions)
-    where = 'stays' if then.state is state else str(then.state)
+    where = 'stay' if then.state is state else f'→ {then.state}'
     return f'{where}: {out}' if out else where
 
 
