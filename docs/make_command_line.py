@@ -9,14 +9,15 @@ from pathlib import Path
 from remaster_ros.cli.main import VERBS, build_parser
 
 PAGE = Path(__file__).parent / 'command-line.md'
-COMMON = {'--help', '--seed', '--quiet', '--no-figures'}
+COMMON = {'--help', '--seed', '--quiet', '--no-figures', '--json'}
 HEAD = """# Command line
 
 This page lists the commands with all options. Written by `make docs` from the parsers; a test
 keeps it equal. `remaster VERB --help` shows the same.
 
 Every verb also takes `--help`, `--seed SEED` (of all randomness, default 0), `--quiet` (print
-nothing but errors) and `--no-figures`. `remaster --version` prints the version,
+nothing but errors), `--no-figures` and, but for `demo`, `watch` and `replay`, `--json` (print one
+JSON object in place of a summary). `remaster --version` prints the version,
 `eval "$(remaster --completion bash)"` (or zsh, fish) completes verbs and options.
 
 Exit status: 0 done, 1 the data allow no answer, 2 wrong usage or bad input; 3 of `recover`:

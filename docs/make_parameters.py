@@ -43,15 +43,15 @@ Times are in the node's time, simulated where `use_sim_time` is set, unless it s
 
 def page() -> str:
     """Return the page."""
-    names = {path.name for path in (ROOT / 'scripts').iterdir() if path.is_file()}
+    # The script of the demo runs a verb, which takes options and no parameter file.
+    names = {path.name for path in (ROOT / 'scripts').iterdir() if path.is_file()} - {'demo'}
     order = [*FIRST, *sorted(names - set(FIRST))]
     return '\n'.join([HEAD, *(section(name) for name in order)])
 
 
 def section(node: str) -> str:
     """Return the heading and the table of one node."""
-    module = 'demo.conductor' if node == 'demo' else f'nodes.{node}'
-    kind = importlib.import_module(f'remaster_ros.{module}').Parameters
+    kind = importlib.import_module(f'remaster_ros.nodes.{node}').Parameters
     rows = [row(field) for field in parameter_fields(kind).values()]
     return '\n'.join(
         [
