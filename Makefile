@@ -6,6 +6,7 @@
 #   make qualify  all of them, and the campaigns that it leaves out; an hour and a half on two cores
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
+#   make mutants FOLDER=remaster_ros/motion    which changes of the code its unit tests do not notice
 #   make docs     the site, build/docs/index.html, and its pages that come from the code
 #   make faults   the tables of test/faults/observed.md from what the tests observe (FAULTS=add keeps the old)
 # The first of them makes a virtual environment. With ROS 2 Jazzy sourced its rclpy is used and the
@@ -13,7 +14,7 @@
 
 SHELL := /bin/bash
 .NOTPARALLEL:
-.PHONY: help demo test qualify check bench docs faults format clean
+.PHONY: help demo test qualify check bench mutants docs faults format clean
 
 ifneq ($(and $(ROS_DISTRO),$(AMENT_PREFIX_PATH)),)
 KIND := ros
@@ -32,7 +33,7 @@ export PYTHON
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
 help:
-	@sed -n '1,12s/^# \{0,1\}//p' Makefile
+	@sed -n '1,13s/^# \{0,1\}//p' Makefile
 
 $(VENV)/installed: setup.py setup.cfg $(CONSTRAINTS) tools/make-venv
 	@tools/make-venv $(VENV) $(KIND)
@@ -85,6 +86,14 @@ bench: $(VENV)/bench-installed
 
 $(VENV)/bench-installed: $(VENV)/installed
 	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[bench]'
+	@touch $@
+
+# FOLDER is a folder of the package, or one module of it.
+mutants: $(VENV)/mutants-installed
+	tools/mutants $(BIN)/python $(or $(FOLDER),$(error say make mutants FOLDER=remaster_ros/motion))
+
+$(VENV)/mutants-installed: $(VENV)/installed
+	$(BIN)/python -m pip install -qq -c $(CONSTRAINTS) --no-build-isolation -e '.[mutants]'
 	@touch $@
 
 # A page that warns (a link to nowhere, a name that is not there) ends it with an error.

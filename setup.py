@@ -137,6 +137,8 @@ setup(
         # What the benchmarks compare with; figaroh and pybotics get environments of their own.
         'bench': ['emcee>=3.1', 'numpyro>=0.15', 'jax>=0.4.30'],
         'check': ['ruff', 'mypy', 'types-PyYAML', 'import-linter'],
+        # `make mutants`.
+        'mutants': ['mutmut>=3.8'],
     },
     zip_safe=False,
     entry_points={'console_scripts': ['remaster = remaster_ros.cli.main:main']},
