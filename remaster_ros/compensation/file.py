@@ -34,13 +34,17 @@ from remaster_ros.kinematics.pad_angles import coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.json_records import plain
+from remaster_ros.session.json_records import decoded, plain
 from remaster_ros.types import Controller, FloatArray, Session
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-compensation/1'
 COMPENSATION_FILE = 'compensation.json'
 FILE_LIMIT = 256 * 1024**2
+REMEDY = (
+    f'this is no {COMPENSATION_FILE} of remaster: give the one in the folder apply that fit, '
+    'discover or report has written'
+)
 # Digits of the covariance's root: the errors of a marker are a millionth of those of the
 # parameters, which compensate each other.
 DIGITS = 10
@@ -357,8 +361,7 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
         One line naming the file, the place in it and the remedy.
     """
     path = Path(path)
-    hint = 'give apply/compensation.json that fit or discover has written'
-    return of_text(read_limited(path, FILE_LIMIT, hint), path)
+    return of_text(read_limited(path, FILE_LIMIT, REMEDY), path)
 
 
 def of_text(data: bytes, path: Path) -> Compensation:
@@ -366,12 +369,7 @@ def of_text(data: bytes, path: Path) -> Compensation:
 
     Raises InputError as `read_compensation` does.
     """
-    try:
-        content = msgspec.json.decode(data, type=CompensationPart)
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise _not_one(path, _other_format(data) or str(error)) from None
-    if content.format != FORMAT:
-        raise _not_one(path, _other_format(data) or 'its format is empty')
+    content = decoded(data, path, CompensationPart, FORMAT, REMEDY)
     try:
         _refuse_huge(content)
         model = _model(content)
@@ -396,30 +394,6 @@ def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
     elif not isinstance(value, str | None):
         for key, one in value.items() if isinstance(value, dict) else enumerate(value):
             yield from _numbers(one, f'{where}.{key}')
-
-
-class _AnyFile(Struct):
-    """The key that each JSON file of this program has."""
-
-    format: str = ''
-
-
-def _other_format(data: bytes) -> str:
-    """Sentence that the file has another format of this program; '' if unknown."""
-    try:
-        given = msgspec.json.decode(data, type=_AnyFile).format
-    except (msgspec.DecodeError, RecursionError):
-        return ''
-    # Before its keys: another file's would only confuse.
-    return f'its format is {given[:60]!r}, not {FORMAT!r}' if given not in ('', FORMAT) else ''
-
-
-def _not_one(path: Path, why: str) -> InputError:
-    """InputError that the file is no compensation.json."""
-    return InputError(
-        f'{path}: this is no {COMPENSATION_FILE} of remaster ({why}); give the one in the folder '
-        'apply that fit, discover or report has written'
-    )
 
 
 def _model(content: CompensationPart) -> ArmModel:

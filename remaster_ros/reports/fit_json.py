@@ -41,7 +41,7 @@ from remaster_ros.reports import schemas
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.json_records import Record, checked
+from remaster_ros.session.json_records import Record, checked, decoded, has_format
 from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
@@ -368,17 +368,7 @@ def read_result(path: Path, schema: type[Record], form: str, name: str, verb: st
     Raises InputError if it is damaged, of another format, or lacks a key.
     """
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
-    try:
-        content = msgspec.json.decode(data)
-        # First: another file's keys would only confuse.
-        given = content.get('format', form) if isinstance(content, dict) else form
-        if given != form:
-            raise InputError(f'{path}: format is {str(given)[:60]!r}, not {form!r}; {verb} again')
-        return msgspec.convert(content, schema)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(
-            f'{path}: {" ".join(str(error).split())}; give a {name} of format {form}'
-        ) from None
+    return decoded(data, path, schema, form, f'give a {name} of format {form}')
 
 
 def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, FloatArray]:
@@ -427,9 +417,5 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
 
 def require_own(path: Path, format_: str) -> None:
     """Raise InputError if a file to be replaced is not a JSON file of this format."""
-    try:
-        content = msgspec.json.decode(read_limited(path, FIT_LIMIT, 'it was there'))
-    except (msgspec.DecodeError, RecursionError):
-        content = None
-    if not isinstance(content, dict) or content.get('format') != format_:
+    if not has_format(read_limited(path, FIT_LIMIT, 'it was there'), format_):
         raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')
