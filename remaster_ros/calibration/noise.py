@@ -124,6 +124,8 @@ RESOLUTION_M = 1e-7
 MEDIAN_LENGTH = 1.5381722545
 # Number of rows whose features are in memory at once for the sum of their Gram matrices.
 GRAM_ROWS = 2_000
+# Number of rows that are whitened at once.
+WHITENED_ROWS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,40 +385,30 @@ class NoiseModel:
             if group.kind == 'frames'
         }
 
-    def whitened(self, values: NDArray[Any], noise: Noise) -> NDArray[Any]:
+    def whitened(
+        self, values: NDArray[Any], noise: Noise, out: NDArray[Any] | None = None
+    ) -> NDArray[Any]:
         """Vectors (n, 3, ...) in units of the noise: independent, with variance 1 in all rows.
 
         If a sensor's noise depends on the direction, the vectors are in the rows' `frames`.
+        ``out``: where to write them, of the same shape.
         """
-        rows, kind = self.rows, values.dtype
-        flat = values.reshape(len(rows), 3, -1)
-        if self.frames is not None:
-            flat = self.frames.astype(kind) @ flat
-        flat = rows.decorrelated(flat)
-        sigma, pose_sigma, frame_sigma = self._of_groups(noise)
-        size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]
-        inner = np.sqrt(sigma**2 + size * frame_sigma**2)
-        outer = np.sqrt(inner**2 + count * size * pose_sigma**2)
-        # With M the size of a frame, w = sqrt(harmonic mean / M), means f of frames, p of poses:
-        # (value - f) / sigma + w (f - p) / inner + w p / outer. A frame of one row is its value.
-        of_frame = rows.group_of_frame
-        ratio = np.sqrt(size[of_frame] / rows.frame_size[:, None])
-        means = flat
-        if rows.frame is not None:
-            means = rows.frame_sum(flat) / rows.frame_size[:, None, None].astype(kind)
-        of_poses = rows.sum_of_frames(means.reshape(len(of_frame), -1))
-        of_poses = of_poses.reshape(len(size), 3, -1) / count[:, :, None].astype(kind)
-        of_poses *= (1.0 / inner - 1.0 / outer)[:, :, None].astype(kind)
-        white = flat * (1.0 / sigma)[rows.group_of_row][:, :, None].astype(kind)
-        if rows.frame is None:
-            white -= of_poses[of_frame]
-        else:
-            less = (1.0 / sigma[of_frame] - ratio / inner[of_frame])[:, :, None].astype(
-                kind
-            ) * means
-            less += of_poses[of_frame] * ratio[:, :, None].astype(kind)
-            white -= np.repeat(less, rows.frame_size, axis=0)
-        return white.reshape(values.shape)
+        white = np.empty_like(values) if out is None else out
+        parts = self._of_groups(noise)
+        # Rows that are correlated along the path are taken whole; of others some at a time, so
+        # that what is between is in the processor's cache and in memory once.
+        most = len(self.rows) + 1 if self.rows.decorrelation else WHITENED_ROWS
+        for first, last in self.rows.blocks(most):
+            rows = self.rows.of_groups(first, last)
+            start = int(self.rows.group_start[first])
+            span = slice(start, start + len(rows))
+            flat = values[span].reshape(len(rows), 3, -1)
+            if self.frames is not None:
+                flat = self.frames[span].astype(values.dtype) @ flat
+            white[span] = _whitened(
+                rows, rows.decorrelated(flat), *(part[first:last] for part in parts)
+            ).reshape(white[span].shape)
+        return white
 
     def _of_groups(self, noise: Noise) -> FloatArray:
         """Sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
@@ -428,6 +420,41 @@ class NoiseModel:
             ):
                 part[of_sensor, axes] = of_channel[index]
         return parts
+
+
+def _whitened(
+    rows: Rows,
+    flat: NDArray[Any],
+    sigma: FloatArray,
+    pose_sigma: FloatArray,
+    frame_sigma: FloatArray,
+) -> NDArray[Any]:
+    """Vectors in the axes of the channels, (n, 3, c), in units of the noise of each group.
+
+    ``sigma, pose_sigma, frame_sigma``: by group and axis, m, (groups, 3).
+    """
+    kind = flat.dtype
+    size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]
+    inner = np.sqrt(sigma**2 + size * frame_sigma**2)
+    outer = np.sqrt(inner**2 + count * size * pose_sigma**2)
+    # With M the size of a frame, w = sqrt(harmonic mean / M), means f of frames, p of poses:
+    # (value - f) / sigma + w (f - p) / inner + w p / outer. A frame of one row is its value.
+    of_frame = rows.group_of_frame
+    ratio = np.sqrt(size[of_frame] / rows.frame_size[:, None])
+    means = flat
+    if rows.frame is not None:
+        means = rows.frame_sum(flat) / rows.frame_size[:, None, None].astype(kind)
+    of_poses = rows.sum_of_frames(means.reshape(len(of_frame), -1))
+    of_poses = of_poses.reshape(len(size), 3, -1) / count[:, :, None].astype(kind)
+    of_poses *= (1.0 / inner - 1.0 / outer)[:, :, None].astype(kind)
+    white: NDArray[Any] = flat * (1.0 / sigma)[rows.group_of_row][:, :, None].astype(kind)
+    if rows.frame is None:
+        white -= of_poses[of_frame]
+        return white
+    less = (1.0 / sigma[of_frame] - ratio / inner[of_frame])[:, :, None].astype(kind) * means
+    less += of_poses[of_frame] * ratio[:, :, None].astype(kind)
+    white -= np.repeat(less, rows.frame_size, axis=0)
+    return white
 
 
 def _frames(rows: Rows, reference: FloatArray) -> FloatArray:

@@ -24,10 +24,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.blas import sgemm
 
 from remaster_ros.calibration.noise import Noise
 from remaster_ros.discovery.effects.base import LARGEST_M, Candidate, Design
@@ -37,6 +38,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 
 Single = NDArray[np.float32]
+Where = IntArray | slice
 
 # Prior standard deviations of a weight, RMS displacement of the marker, m: half-decades from a
 # fifth of the noise of the best trackers to what no calibrated arm exceeds.
@@ -48,6 +50,10 @@ KIND_ODDS = 1.0 / 20.0
 FAR = 12.0
 # Share of the largest eigenvalue below which a direction is rounding.
 ROUNDING = 1e-9
+# Rows of columns that are worked on at once, so that they are in the processor's cache.
+ROWS = 64
+# Blocks whose products with all columns are computed with those of another.
+AHEAD = 15
 # A column with a smaller RMS displacement per unit displaces nothing, m.
 NOTHING = 1e-12
 # Share of the largest displacement, in square, of the directions of a penalised candidate.
@@ -155,10 +161,18 @@ class Pool:
         self.blocks: list[Block] = []
         # Displacements by a unit of each weight, m, (n, 3, m)
         self.columns: Single = np.zeros((len(data), 3, 0), np.float32)
+        self.log_prior = np.zeros(0)
+        self._names: list[str] = []
+        self._users: dict[str, set[int]] = {}  # Blocks with each parameter
+        self.excluded: list[IntArray] = []  # Blocks that are in no model with each
+        self.place: dict[object, int] = {}  # Index of the block of each candidate, by key
         self.extend(blocks)
 
     def extend(self, blocks: Sequence[Block]) -> None:
         """Append blocks to the pool, with their columns."""
+        if self.blocks and not blocks:
+            return
+        known = len(self.blocks)
         self.blocks += blocks
         self.sizes = np.array([block.size for block in self.blocks], dtype=np.int64)
         ends = np.cumsum([0, *self.sizes])
@@ -172,27 +186,28 @@ class Pool:
             where = slice(start, start + block.size)
             self.columns[:, :, where] = block.displacement(self.data.part)
             start = where.stop
-        self.log_prior = np.array([block.log_prior for block in self.blocks])
+        self.log_prior = np.append(self.log_prior, [block.log_prior for block in blocks])
         self.allowed = np.array([block.allowed for block in self.blocks])
         self.sign = np.array([block.sign for block in self.blocks])
         # Errors of one kind come together; what has no name is no kind, and happens once.
-        names = [
+        self._names += [
             str(block.candidate.key)
             if EFFECTS[block.candidate.name].cause_per == 'variant'
             else block.candidate.name
-            for block in self.blocks
+            for block in blocks
         ]
-        self.kind: IntArray = np.unique(names, return_inverse=True)[1]
-        users: dict[str, set[int]] = {}
-        for index, block in enumerate(self.blocks):
+        self.kind: IntArray = np.unique(self._names, return_inverse=True)[1]
+        users, touched = self._users, set()
+        for index, block in enumerate(blocks, known):
+            self.place[block.candidate.key] = index
             for name in block.candidate.parameters:
                 users.setdefault(name, set()).add(index)
+                touched |= users[name]
         # Blocks with a parameter in common are one cause twice: never in one model.
-        self.excluded = [
-            np.array(sorted(set().union(*(users[name] for name in block.candidate.parameters))))
-            for block in self.blocks
-        ]
-        self.place = {block.candidate.key: index for index, block in enumerate(self.blocks)}
+        self.excluded += [np.zeros(0, np.int64)] * len(blocks)
+        for index in touched:
+            names = self.blocks[index].candidate.parameters
+            self.excluded[index] = np.array(sorted(set().union(*(users[name] for name in names))))
 
     def prior(self, model: Model) -> float:
         """Return the log prior odds of a model."""
@@ -210,8 +225,16 @@ class Surface:
     matrix is diagonal: their prior is the same in all directions.
     """
 
-    def __init__(self, pool: Pool, noise: Noise, background: Mapping[Candidate, float]) -> None:
+    def __init__(
+        self,
+        pool: Pool,
+        noise: Noise,
+        background: Mapping[Candidate, float],
+        last: Surface | None = None,
+    ) -> None:
+        """Make the surface; of the one before, which is of no use any more, it takes the room."""
         self.pool, data = pool, pool.data
+        self.noise, self.background = noise, dict(background)
         n = 3 * len(data)
         std = np.concatenate([np.zeros(0), *(np.full(c.size, s) for c, s in background.items())])
         columns = data.columns(list(background)) * std
@@ -231,34 +254,119 @@ class Surface:
         U = absorbed @ (turn[:, seen] / np.sqrt(square[seen]))
         shrink = 1.0 - 1.0 / np.sqrt(1.0 + square[seen])
         self.errors = errors - U @ (shrink * (U.T @ errors))
-        both = np.concatenate((Q, U), axis=1)
-        white_columns = data.noise_model.whitened(pool.columns, noise).reshape(n, -1)
-        product = both[:n].T.astype(np.float32) @ white_columns
-        product[Q.shape[1] :] *= shrink.astype(np.float32)[:, None]
-        white_columns -= both[:n].astype(np.float32) @ product
-        if len(rows):
-            tail = -(both[n:].astype(np.float32) @ product)
-            white_columns = np.concatenate((white_columns, tail))
-        self.columns: Single = white_columns
-        self._turn()
-        self.pull = (self.errors.astype(np.float32) @ self.columns).astype(float)
-        self.square = np.einsum('ij,ij->j', self.columns, self.columns).astype(float)
+        # What is taken out of columns, by their products with the same.
+        self._both: Single = np.concatenate((Q, U), axis=1).astype(np.float32)
+        self._share = np.concatenate((np.ones(p), shrink)).astype(np.float32)
+        self.columns: Single = np.zeros((n + len(rows), 0), np.float32)
+        self.pull, self.square = np.zeros(0), np.zeros(0)
+        # Where the columns are; it may be longer than they are.
+        self.room: Single = np.zeros(0, np.float32) if last is None else last.room
+        # Products of the columns of blocks that were asked for: with all columns, with each other.
+        self._rows: dict[int, Single] = {}
+        self._grams: dict[int, FloatArray] = {}
+        self.extend()
 
-    def _turn(self) -> None:
-        """Turn the weights of each block to the principal axes of its Gram matrix."""
-        first, sizes = self.pool.first, self.pool.sizes
-        pairs = first[sizes == 2]
-        one, other = self.columns[:, pairs], self.columns[:, pairs + 1]
-        a, b, c = (
-            np.einsum('ij,ij->j', x, y) for x, y in ((one, one), (one, other), (other, other))
+    def has(self, noise: Noise, background: Mapping[Candidate, float]) -> bool:
+        """Return whether the surface is that of a noise and a background."""
+        mine, parts = self.noise, ('sigma', 'pose_sigma', 'frame_sigma')
+        return self.background == background and all(
+            np.array_equal(getattr(mine, part), getattr(noise, part)) for part in parts
         )
+
+    def extend(self) -> None:
+        """Add what has been added to the pool."""
+        known, count = self.columns.shape[1], self.pool.columns.shape[2]
+        if count == known:
+            return
+        before, height = self.columns, len(self.errors)
+        if known or len(self.room) < height * count:
+            self.room = np.empty(height * count, np.float32)
+        self.columns = self.room[: height * count].reshape(height, count)
+        self.columns[:, :known] = before
+        n = 3 * len(self.pool.data)
+        new = self.pool.columns[:, :, known:]
+        white = self.columns if not known else np.empty((height, count - known), np.float32)
+        self.pool.data.noise_model.whitened(new, self.noise, white[:n].reshape(new.shape))
+        white[n:] = 0.0
+        product = self._both.T @ white
+        product *= self._share[:, None]
+        # In place: as large as all columns.
+        sgemm(-1.0, product.T, self._both.T, 1.0, white.T, overwrite_c=1)
+        self._turn(white, known)
+        if known:
+            self.columns[:, known:] = white
+        pull = (self.errors.astype(np.float32) @ white).astype(float)
+        square = np.einsum('ij,ij->j', white, white).astype(float)
+        self.pull = np.concatenate((self.pull, pull))
+        self.square = np.concatenate((self.square, square))
+        self._rows.clear()
+
+    def is_known(self, block: int) -> bool:
+        """Return whether the products of the columns of a block with all are known."""
+        return block in self._rows
+
+    def fetch(self, blocks: Sequence[int]) -> None:
+        """Compute the products of the columns of some blocks with all columns, at once."""
+        new = [block for block in blocks if not self.is_known(block)]
+        if not new:
+            return
+        of = self.pool.of
+        rows = self.columns[:, np.concatenate([of[block] for block in new])].T @ self.columns
+        edges = np.cumsum([0, *(len(of[block]) for block in new)])
+        for block, start, stop in zip(new, edges[:-1], edges[1:], strict=True):
+            self._rows[block] = rows[start:stop]
+
+    def products(self, block: int, gains: FloatArray | None = None) -> Single:
+        """Return the products of the columns of a block with all columns, (weights, m).
+
+        ``gains``: as of a `State`: what is most likely to be asked for next is computed, too, as
+        all columns are read from memory once.
+        """
+        if not self.is_known(block):
+            ahead = [block]
+            if gains is not None:
+                best = gains.max(axis=1)
+                ahead += np.argpartition(-best, min(AHEAD, len(best) - 1))[:AHEAD].tolist()
+            self.fetch([*dict.fromkeys(ahead)])
+        return self._rows[block]
+
+    def gram(self, block: int) -> FloatArray:
+        """Return the products of the columns of a block with each other, (weights, weights)."""
+        if block not in self._grams:
+            mine = self.columns[:, self.pool.of[block]]
+            self._grams[block] = (mine.T @ mine).astype(float)
+        return self._grams[block]
+
+    def between(self, block: int, model: Sequence[tuple[int, int]]) -> FloatArray:
+        """Return the products of the columns of a block with those of a model, (weights, q)."""
+        own = self.pool.of[block]
+        rows = [self.products(other)[:, own] for other, _ in model]
+        return np.concatenate(rows).T.astype(float)
+
+    def _turn(self, columns: Single, first: int) -> None:
+        """Turn the weights of each block to the principal axes of its Gram matrix.
+
+        ``columns``: those from the index ``first`` on.
+        """
+        new = self.pool.first >= first
+        start, sizes = self.pool.first[new] - first, self.pool.sizes[new]
+        pairs = start[sizes == 2]
+        spans = [slice(i, i + ROWS) for i in range(0, len(columns), ROWS)]
+        a, b, c = np.zeros((3, len(pairs)), np.float32)
+        for span in spans:
+            one, other = columns[span, pairs], columns[span, pairs + 1]
+            a += np.einsum('ij,ij->j', one, one)
+            b += np.einsum('ij,ij->j', one, other)
+            c += np.einsum('ij,ij->j', other, other)
         angle = 0.5 * np.arctan2(2.0 * b, a - c)
         cosine, sine = np.cos(angle), np.sin(angle)
-        self.columns[:, pairs] = cosine * one + sine * other
-        self.columns[:, pairs + 1] = cosine * other - sine * one
-        for start, size in zip(first[sizes > 2], sizes[sizes > 2], strict=True):
-            mine = self.columns[:, start : start + size]
-            self.columns[:, start : start + size] = mine @ np.linalg.eigh(mine.T @ mine)[1]
+        for span in spans:
+            one, other = columns[span, pairs], columns[span, pairs + 1]
+            columns[span, pairs] = cosine * one + sine * other
+            columns[span, pairs + 1] = cosine * other - sine * one
+        for i, size in zip(start[sizes > 2], sizes[sizes > 2], strict=True):
+            mine = columns[:, i : i + size]
+            columns[:, i : i + size] = mine @ np.linalg.eigh(mine.T @ mine)[1]
 
 
 class State:
@@ -266,7 +374,8 @@ class State:
 
     Products of the columns are those of their residuals beside the model: with the errors
     (``pull``, (m,)), and with themselves (``square``, (m,)). ``value``: log posterior relative to
-    that of the model of no block.
+    that of the model of no block. What needs all columns is computed when it is asked for: most
+    models are proposed and refused by their value.
     """
 
     def __init__(
@@ -274,17 +383,16 @@ class State:
         surface: Surface,
         model: tuple[tuple[int, int], ...],
         value: float,
-        pull: FloatArray,
-        square: FloatArray,
         inverse: FloatArray,
         weights: FloatArray,
-        regression: Callable[[], Single],
+        products: Callable[[], tuple[FloatArray, FloatArray]],
+        regression: Callable[[Where], Single],
     ) -> None:
         self.surface, self.model, self.value = surface, model, value
-        self.pull, self.square = pull, square
         self.inverse = inverse  # H⁻¹ of the weights of the blocks, (q, q)
         self.weights = weights  # Their means, (q,)
-        self._regression: Callable[[], Single] | None = regression
+        self._products: Callable[[], tuple[FloatArray, FloatArray]] | None = products
+        self._regression: Callable[[Where], Single] | None = regression
 
     @classmethod
     def empty(cls, surface: Surface) -> State:
@@ -294,16 +402,16 @@ class State:
             surface,
             (),
             0.0,
-            surface.pull,
-            surface.square,
             np.zeros((0, 0)),
             np.zeros(0),
-            lambda: none,
+            lambda: (surface.pull, surface.square),
+            lambda where: none[:, where],
         )
 
     @classmethod
     def of(cls, surface: Surface, model: Model) -> State:
         """Return a model."""
+        surface.fetch([block for block, _ in model])
         state = cls.empty(surface)
         for block, level in model:
             state = state.with_block(block, level)
@@ -313,10 +421,33 @@ class State:
     def regression(self) -> Single:
         """Regression of all columns on those of the model, (q, m)."""
         assert self._regression is not None
-        found = self._regression()
-        # The state before is kept no longer.
+        found = self._regression(slice(None))
+        # Columns and states before are kept no longer.
         self._regression = None
         return found
+
+    def regression_of(self, where: IntArray) -> Single:
+        """Return the regression of some columns on those of the model, (q, c)."""
+        if self._regression is None:
+            return self.regression[:, where]
+        return self._regression(where)
+
+    @cached_property
+    def _pull_and_square(self) -> tuple[FloatArray, FloatArray]:
+        assert self._products is not None
+        found = self._products()
+        self._products = None
+        return found
+
+    @property
+    def pull(self) -> FloatArray:
+        """Products of the columns with the errors, beside the model, (m,)."""
+        return self._pull_and_square[0]
+
+    @property
+    def square(self) -> FloatArray:
+        """Products of the columns with themselves, beside the model, (m,)."""
+        return self._pull_and_square[1]
 
     @cached_property
     def places(self) -> list[slice]:
@@ -347,47 +478,66 @@ class State:
     @cached_property
     def losses(self) -> FloatArray:
         """Loss in log posterior by leaving out each block of the model, (blocks of the model,)."""
-        lost, pool = [], self.surface.pool
-        for (block, level), where in zip(self.model, self.places, strict=True):
-            covariance, mean = self.inverse[where, where], self.weights[where]
-            determinant = np.linalg.slogdet(covariance)[1] - 2.0 * len(mean) * np.log(
-                LEVELS_M[level]
-            )
-            worth = 0.5 * (mean @ np.linalg.solve(covariance, mean) + determinant)
-            lost.append(worth + self._prior(block, self.kinds.count(pool.kind[block]) > 1))
-        return np.array(lost)
+        pool = self.surface.pool
+        which = np.array([block for block, _ in self.model], dtype=np.int64)
+        levels = LEVELS_M[[level for _, level in self.model]]
+        of_kind = np.bincount(pool.kind[which], minlength=1)
+        alone = of_kind[pool.kind[which]] == 1
+        lost = pool.log_prior[which] + np.where(alone, np.log(KIND_ODDS), 0.0)
+        single = pool.sizes[which] == 1
+        first = np.array([where.start for where in self.places], dtype=np.int64)[single]
+        variance, mean = np.diag(self.inverse)[first], self.weights[first]
+        lost[single] += 0.5 * (mean**2 / variance + np.log(variance / levels[single] ** 2))
+        for position in np.flatnonzero(~single).tolist():
+            where = self.places[position]
+            covariance, means = self.inverse[where, where], self.weights[where]
+            determinant = np.linalg.slogdet(covariance / levels[position] ** 2)[1]
+            lost[position] += 0.5 * (means @ np.linalg.solve(covariance, means) + determinant)
+        return lost
 
     def with_block(self, block: int, level: int) -> State:
         """Return the model with a block more."""
-        pool, columns = self.surface.pool, self.surface.columns
+        surface, pool = self.surface, self.surface.pool
         own = pool.of[block]
-        residual: Single = columns[:, own].T @ columns
+        between = self.regression_of(own).astype(float)
+        gram = surface.gram(block)
         if self.model:
-            residual -= residual[:, self.columns] @ self.regression
-        gram = residual[:, own].astype(float)
+            gram = gram - surface.between(block, self.model) @ between
         gram = 0.5 * (gram + gram.T) + np.eye(len(own)) * LEVELS_M[level] ** -2.0
         middle = np.linalg.inv(gram)
-        mean = middle @ self.pull[own]
-        gain = 0.5 * (mean @ self.pull[own] + np.linalg.slogdet(middle)[1])
+        pull = self.pull[own]
+        mean = middle @ pull
+        gain = 0.5 * (mean @ pull + np.linalg.slogdet(middle)[1])
         gain += self._prior(block, pool.kind[block] in self.kinds)
         gain -= len(own) * np.log(LEVELS_M[level])
-        step = middle.astype(np.float32) @ residual
-        between = self.regression[:, own].astype(float)
         corner = -between @ middle
-
-        def regression() -> Single:
-            return np.concatenate((self.regression - between.astype(np.float32) @ step, step))
-
-        if np.isfinite(self.gains[block, level]):
+        if 'gains' in self.__dict__ and np.isfinite(self.gains[block, level]):
             self.gains[block, level] = gain
+
+        @cache
+        def residual() -> Single:
+            found = surface.products(block, self.__dict__.get('gains'))
+            return found - found[:, self.columns] @ self.regression if self.model else found
+
+        def products() -> tuple[FloatArray, FloatArray]:
+            step = middle.astype(np.float32) @ residual()
+            return (
+                self.pull - mean @ residual(),
+                self.square - np.einsum('km,km->m', residual(), step),
+            )
+
+        def regression(where: Where) -> Single:
+            step = middle.astype(np.float32) @ residual()[:, where]
+            before = self.regression[:, where]
+            return np.concatenate((before - between.astype(np.float32) @ step, step))
+
         return State(
-            self.surface,
+            surface,
             (*self.model, (block, level)),
             self.value + float(gain),
-            self.pull - mean @ residual,
-            self.square - np.einsum('km,km->m', residual, step),
             np.block([[self.inverse - corner @ between.T, corner], [corner.T, middle]]),
             np.concatenate((self.weights - between @ mean, mean)),
+            products,
             regression,
         )
 
@@ -397,20 +547,26 @@ class State:
         out[self.places[position]] = True
         middle = np.linalg.inv(self.inverse[out][:, out])
         pulled = self.inverse[~out][:, out] @ middle
-        across = self.regression[out]
 
-        def regression() -> Single:
-            return self.regression[~out] - pulled.astype(np.float32) @ across
+        def products() -> tuple[FloatArray, FloatArray]:
+            across = self.regression[out]
+            turned = middle.astype(np.float32) @ across
+            return (
+                self.pull + (middle @ self.weights[out]) @ across,
+                self.square + np.einsum('km,km->m', across, turned),
+            )
 
-        turned = middle.astype(np.float32) @ across
+        def regression(where: Where) -> Single:
+            before = self.regression[:, where]
+            return before[~out] - pulled.astype(np.float32) @ before[out]
+
         return State(
             self.surface,
             (*self.model[:position], *self.model[position + 1 :]),
             self.value - float(self.losses[position]),
-            self.pull + (middle @ self.weights[out]) @ across,
-            self.square + np.einsum('km,km->m', across, turned),
             self.inverse[~out][:, ~out] - pulled @ self.inverse[out][:, ~out],
             self.weights[~out] - pulled @ self.weights[out],
+            products,
             regression,
         )
 

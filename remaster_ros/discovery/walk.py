@@ -368,6 +368,7 @@ class Walk:
             )
             dated |= {one.key: one for one in (candidate, *others) if one.key not in tried}
         self.pool = Pool(data, blocks_of(data, [*singles, *dated.values()]))
+        self._last_surface: Surface | None = None
         self._known: dict[Model, Evaluated | None] = {}
         # Models whose kinds of the background have been chosen anew.
         self._wholes: dict[Model, Evaluated | None] = {}
@@ -392,6 +393,8 @@ class Walk:
         if changed and self._refined():
             self.chains.append(self._chain(self._best_found, hot=False))
         self._weigh()
+        # As large as the columns of the pool.
+        self._last_surface = None
 
     @property
     def _best_found(self) -> Evaluated:
@@ -442,15 +445,17 @@ class Walk:
         best = self._best_found
         context, tried = self.data.part, [block.candidate for block in self.pool.blocks]
         added = False
+        waiting: dict[object, Candidate] = {}
         for position, (block, _) in enumerate(best.model):
             candidate = self.pool.blocks[block].candidate
             if not candidate.happened:
                 finer = EFFECTS[candidate.name].finer
                 nearby = [] if finer is None else [*finer(context, candidate)]
-                nearby = [one for one in nearby if one.key not in self.pool.place]
-                self.pool.extend(blocks_of(self.data, nearby))
-                added = added or bool(nearby)
+                waiting |= {one.key: one for one in nearby if one.key not in self.pool.place}
                 continue
+            added = added or bool(waiting)
+            self.pool.extend(blocks_of(self.data, [*waiting.values()]))
+            waiting = {}
             moments = np.unique([one.moment for one in tried if one.name == candidate.name])
             low = np.max(moments[moments < candidate.moment], initial=-np.inf)
             high = np.min(moments[moments > candidate.moment], initial=np.inf)
@@ -461,7 +466,7 @@ class Walk:
             ]
             first = len(self.pool.blocks)
             self.pool.extend(blocks_of(self.data, nearby))
-            surface = Surface(self.pool, best.noise, best.std)
+            surface = self._surface(best.noise, best.std)
             rest = State.of(surface, best.model[:position] + best.model[position + 1 :])
             near = [block, *range(first, len(self.pool.blocks))]
             spread = self._spread_of_moments(rest, candidate)
@@ -473,6 +478,8 @@ class Walk:
             self._known.clear()
             self._wholes.clear()
             added = added or len(near) > 1
+        added = added or bool(waiting)
+        self.pool.extend(blocks_of(self.data, [*waiting.values()]))
         happened = [
             one for block, _ in best.model if (one := self.pool.blocks[block].candidate).happened
         ]
@@ -549,6 +556,14 @@ class Walk:
                 return found
             found = fewer
 
+    def _surface(self, noise: Noise, background: Mapping[Candidate, float]) -> Surface:
+        """Return the surface of a noise and a background; the one before is of no use then."""
+        last = self._last_surface
+        if last is None or not last.has(noise, background):
+            last = self._last_surface = Surface(self.pool, noise, background, last)
+        last.extend()
+        return last
+
     def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
         """Return a model at its own noise and background; None if it cannot be fitted."""
         if model not in self._known:
@@ -567,7 +582,7 @@ class Walk:
                 std = {
                     f.candidate: known[f.candidate.key] for f in every if f.candidate.key in known
                 }
-            surface = Surface(self.pool, noise, std)
+            surface = self._surface(noise, std)
             walker = Walker(State.of(surface, current.model), self.rng)
             self._run(walker, hot)
             best = max(walker.seen, key=lambda model: walker.seen[model])
@@ -746,7 +761,7 @@ class Walk:
         A chain visits few of them, and look-alikes are among these.
         """
         found: dict[Model, float] = {}
-        state = State.of(Surface(self.pool, best.noise, best.std), best.model)
+        state = State.of(self._surface(best.noise, best.std), best.model)
         for position in range(len(best.model)):
             rest = state.without(position)
             order = np.argsort(-rest.gains, axis=None)[:MOST_EXCHANGED]

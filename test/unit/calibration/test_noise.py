@@ -101,3 +101,17 @@ def test_gram_matrices_do_not_depend_on_the_blocks(monkeypatch):
     whole = model.gram(lambda _, where: vectors[where], 4)
     monkeypatch.setattr('remaster_ros.calibration.noise.GRAM_ROWS', 7)
     np.testing.assert_allclose(model.gram(lambda _, where: vectors[where], 4), whole, rtol=1e-9)
+
+
+@pytest.mark.parametrize('given', [rows_of_two_sensors, rows_of_frames])
+def test_rows_are_whitened_some_at_a_time_to_where_they_are_wanted(given, monkeypatch):
+    rows, reference = given()
+    model = NoiseModel.of(rows, reference, ())
+    noise = a_noise(model)
+    vectors = np.random.default_rng(4).standard_normal((len(rows), 3, 5)).astype(np.float32)
+    monkeypatch.setattr('remaster_ros.calibration.noise.WHITENED_ROWS', len(rows) + 1)
+    whole = model.whitened(vectors, noise)
+    monkeypatch.setattr('remaster_ros.calibration.noise.WHITENED_ROWS', 5)
+    room = np.empty_like(vectors)
+    assert model.whitened(vectors, noise, room) is room
+    np.testing.assert_array_equal(room, whole)

@@ -90,6 +90,37 @@ def test_a_block_that_joins_and_leaves_changes_nothing():
             )
 
 
+def test_a_model_that_is_refused_costs_no_product_with_all_columns():
+    ground = Surface(pool(), scene().noise, {})
+    first, *others = np.flatnonzero(pool().sizes == 1).tolist()
+    state = State.of(ground, ((first, 2),))
+    known = state.with_block(others[0], 2).value, state.without(0).value
+    fetched = [ground.is_known(block) for block in range(len(pool().blocks))]
+    assert np.flatnonzero(fetched).tolist() == [first]
+    exact = State.of(ground, ((first, 2), (others[0], 2))).value
+    assert known == (pytest.approx(exact, abs=1e-3), pytest.approx(0.0, abs=1e-3))
+
+
+def test_a_pool_that_grows_makes_the_surface_grow():
+    """What was computed of the columns before stays; the surface takes the room of another."""
+    data = scene()
+    grown = Pool(data, pool().blocks[:20])
+    kinds = {candidates()[0]: 1e-4}
+    before = Surface(grown, data.noise, {})
+    one = Surface(grown, data.noise, kinds, before)
+    assert one.room is before.room
+    grown.extend(pool().blocks[20:])
+    one.extend()
+    whole = Surface(pool(), data.noise, kinds)
+    assert one.has(data.noise, kinds)
+    assert not one.has(data.noise, {})
+    np.testing.assert_allclose(one.columns, whole.columns, atol=1e-5 * np.abs(whole.columns).max())
+    np.testing.assert_allclose(one.square, whole.square, rtol=1e-4, atol=1.0)
+    for mine, fresh in zip(grown.excluded, pool().excluded, strict=True):
+        np.testing.assert_array_equal(mine, fresh)
+    np.testing.assert_allclose(grown.log_prior, pool().log_prior)
+
+
 def test_the_gain_of_a_block_of_one_weight_is_exact():
     state = State.empty(surface())
     single = np.flatnonzero(pool().sizes == 1)[:8].tolist()
