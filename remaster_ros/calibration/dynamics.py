@@ -8,8 +8,10 @@ With q̇ and q̈ of a row, J_j the derivative of the marker by joint j, and t it
     wind-up             J_j f_j w_j: friction, f with the sign of the speed, after a reversal
                         within some travel (`friction_share`), of which two are tried
     inertia             J_j τ_j s_j, τ the torque of the links' inertia (`moving_links`)
-    tool                - a_x m_x along each axis of the tool, a the marker's acceleration: a mode
-                        far above what the motion excites, m = 1 / (2 π f)²
+    tool                - a_x m_x along each axis of the tool, a the acceleration of its frame: a
+                        mode far above what the motion excites, m = 1 / (2 π f)². What drives it is
+                        the acceleration of the tool's centre of mass, which is not known: the same
+                        of the acceleration from the frame to the middle of the markers
 
 Sizes of real machines are Gaussian priors about 0. A lag of all joints is one of the clock: the
 mean of the lags, each weighted with the square of the speed that its joint gives the markers, is
@@ -56,6 +58,8 @@ SOFTNESS_STD = 3e-4
 FEWEST_FRAMES = 40
 # A tool's mode of 7 Hz and above, s².
 MODE_STD_S2 = 5e-4
+# Parameters of the tool's mode: along its axes, by its frame and by the way to its markers.
+MODES = tuple(f'tool_mode_{by}{axis}' for by in ('', 'out_') for axis in 'xyz')
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,15 +118,17 @@ class MotionColumns:
         """Torque of the links' inertia about each joint, N m, (n, k)."""
         return self.links.inertial_torque()
 
-    def swing(self, places: FloatArray) -> FloatArray:
-        """Displacement by a mode along each axis of the tool, m per s², (n, 3, 3).
+    def swing(self, middle: FloatArray) -> FloatArray:
+        """Displacement by a mode along each axis of the tool, m per s², (n, 3, 6).
 
-        ``places``: positions of the markers in the tool frame, m, (n, 3).
+        The first three are driven by the acceleration of the tool frame, the others by that of the
+        middle of the markers, m, (3,), in this frame.
         """
         tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
-        moved = self.links.point_acceleration(apply(tool, places))
-        along = np.einsum('nia,ni->na', tool[:, :3, :3], moved)
-        return np.asarray(-tool[:, :3, :3] * along[:, None, :])
+        frame = self.links.point_acceleration(tool[:, :3, 3])
+        turning = self.links.point_acceleration(apply(tool, middle)) - frame
+        along = [np.einsum('nia,ni->na', tool[:, :3, :3], one) for one in (frame, turning)]
+        return np.concatenate([-tool[:, :3, :3] * one[:, None, :] for one in along], axis=2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,10 +236,10 @@ def dynamic_extension(
                 SOFTNESS_STD * per**2,
             )
             terms.append(Term(where, joint, columns.inertial_torque[:, joint, None]))
-    swing = columns.swing(markers[m.marker])
-    for axis, letter in enumerate('xyz'):
-        where = named(f'tool_mode_{letter}', 's²', MODE_STD_S2)
-        terms.append(Term(where, None, swing[:, :, axis, None]))
+    swing = columns.swing(markers.mean(axis=0))
+    for column, name in enumerate(MODES):
+        where = named(name, 's²', MODE_STD_S2)
+        terms.append(Term(where, None, swing[:, :, column, None]))
     precision = np.diag(np.array(std) ** -2.0)
     power = np.mean(
         (columns.jacobian(markers[m.marker]) * columns.velocity[:, None, :]) ** 2, (0, 1)

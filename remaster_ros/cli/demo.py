@@ -60,10 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'tool comes to where it is wanted; a minute more',
     )
     parser.add_argument(
+        '--dynamics',
+        nargs='?',
+        type=number(0.1, 10.0),
+        const=1.0,
+        default=0.0,
+        metavar='SCALE',
+        help='let the arm lag, wind up, yield and swing while it moves, with sizes of real '
+        'machines (times SCALE), reports at 125 Hz and frames at 120 Hz, so that `remaster import '
+        '--moving` can read the bag of the session; takes as long as a real arm',
+    )
+    parser.add_argument(
         '--rate',
         type=number(1.0, 20.0),
-        default=10.0,
-        help='world time over wall time (1 to 20; default 10)',
+        help='world time over wall time (1 to 20; default 10, with --dynamics 1)',
     )
     parser.add_argument(
         '--watch', action='store_true', help='show it on the live page, until Ctrl-C'
@@ -80,7 +90,8 @@ def run(args: argparse.Namespace) -> NoReturn:
             'out': str(out),
             'seed': args.seed,
             **_collection(args.candidates, bool(args.hide)),
-            'rate': args.rate,
+            'rate': args.rate or (1.0 if args.dynamics else 10.0),
+            'dynamics': args.dynamics,
             'figures': not args.no_figures,
             'quiet': args.quiet,
             'hide': ','.join(args.hide),

@@ -42,6 +42,13 @@ class Parameters:
     hide: str = parameter(
         '', 'what else is wrong with the hidden arm: NAME[@JOINT][:SIZE_MM],…, or random'
     )
+    dynamics: float = parameter(
+        0.0,
+        'hidden dynamics of the arm while it moves: 1 for sizes of real machines; reports and '
+        'frames then come as fast as those of real devices (for rate 1)',
+        low=0.0,
+        high=10.0,
+    )
     figures: bool = parameter(True, 'write figures and the report')
     apply: bool = parameter(
         False, 'correct the arm by what was found, and measure poses that no fit has seen'

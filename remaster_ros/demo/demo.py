@@ -63,6 +63,8 @@ configurations, of which `remaster verify` needs ten."""
 TO_FIT, MOST_CANDIDATES = 4, 60
 """Least number of poses to fit, and most candidates drawn to get them: a fit needs three, and from
 the true positions of the sensors one less may be visible than from the rough ones."""
+REPORTS_HZ, FRAMES_HZ = 125.0, 120.0
+"""Rates of joint states and frames of an arm with dynamics, Hz."""
 LAST_MESSAGES = 50
 """Most messages under way from nodes that have ended."""
 BEFORE_SESSION = {'log', 'ros_home', 'session'}
@@ -132,6 +134,7 @@ class Demo:
                     self.p.rate,
                     self.requests,
                     self.candidates,
+                    self.p.dynamics,
                 )
         except BaseException:
             shutil.rmtree(self.hidden, ignore_errors=True)
@@ -174,7 +177,10 @@ class Demo:
             print_hidden(self.console, discovery, self.world.truth)
         if file is not None:
             self._print_applied(file)
-        (self.out / 'truth.yaml').write_text(yaml.safe_dump(to_plain(self.world.truth)))
+        hidden = to_plain(self.world.truth)
+        if self.world.dynamics is not None:
+            hidden['dynamics'] = to_plain(self.world.dynamics)
+        (self.out / 'truth.yaml').write_text(yaml.safe_dump(hidden))
         self.console.print(f'session: {self.session}')
         for label, folder, data in results:
             self.console.print(f'{label}: {folder / ("report.html" if self.p.figures else data)}')
@@ -243,9 +249,10 @@ class Demo:
         )
         ports = {'command_port': command_port, 'data_port': data_port}
         world = str(self.hidden)
+        fast = bool(self.p.dynamics)
         overrides: dict[str, dict[str, Any]] = {
-            'fake_robot': {'world': world},
-            'fake_optitrack': {'world': world, **ports},
+            'fake_robot': {'world': world, **({'joint_state_rate': REPORTS_HZ} if fast else {})},
+            'fake_optitrack': {'world': world, **ports, **({'rate': FRAMES_HZ} if fast else {})},
             'fake_laser_tracker': {'world': world, 'port': tracker_port},
             'optitrack_markers': {**ports, 'cell': self.p.cell},
             'laser_tracker_markers': {'port': tracker_port, 'cell': self.p.cell},

@@ -211,7 +211,9 @@ class OptiTrackScene:
         ``version``: bitstream of the server: NatNet 2 has fewer flags and no residual.
         """
         behaviour, size = self._behaviour, len(self._offsets)
-        t = self._world.now() if t is None else t
+        sent_s = self._world.now() if t is None else t
+        timing = self._world.camera(self._sensor)
+        t = sent_s if timing is None else sent_s - timing.late_s
         tracked = self._world.line_of_sight(self._sensor, t)
         hidden_params = self._hidden(t, tracked)
         points = self._rng.standard_normal((len(self._labels), 3))
@@ -256,10 +258,11 @@ class OptiTrackScene:
             TRACKING_VALID if tracked else 0,
             tuple((p, i, _MARKER_SIZE_M) for i, p in enumerate(tool, 1)) if old else (),
         )
-        ticks = self.ticks(t)
+        stamped_s = sent_s if timing is None else sent_s - timing.latency_s
+        ticks = self.ticks(stamped_s)
         return Frame(
             number=number,
-            timestamp=t - self._start_s,
+            timestamp=self._by_its_clock(stamped_s),
             labeled_markers=labeled,
             rigid_bodies=(body,),
             marker_sets=((behaviour.rigid_body, tool), ('all', tool)),
@@ -270,7 +273,12 @@ class OptiTrackScene:
 
     def ticks(self, t: float) -> int:
         """Server's fine clock at world time t; it began earlier, as on a real host."""
-        return round((t - self._start_s + 1000.0) * CLOCK_HZ)
+        return round((self._by_its_clock(t) + 1000.0) * CLOCK_HZ)
+
+    def _by_its_clock(self, t: float) -> float:
+        """Time since the start by the server's clock, s, at world time t."""
+        timing = self._world.camera(self._sensor)
+        return (t - self._start_s) * (1.0 if timing is None else 1.0 + timing.drift)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
         """Flags of the hidden marker; None while all are visible."""

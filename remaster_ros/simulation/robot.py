@@ -129,7 +129,7 @@ class FakeArm:
         if 'repeated' in faults and self._last is not None:
             return self._last
         now -= faults.get('late', 0.0)
-        q, velocity = self.world.reported(now)
+        q, velocity = self.world.encoders(now), self.world.reported(now)[1]
         per_radian = self.world.chain.per_radian
         q = q + self._rng.normal(0.0, ENCODER_RAD, len(q)) * per_radian
         if 'copy' in faults and self._commanded is not None and now >= self._commanded[0]:
@@ -145,6 +145,8 @@ class FakeArm:
         prefix = 'other_' if 'renamed' in faults else ''
         names = [prefix + self.names[i] for i in order]
         stamp, q, velocity = now + faults.get('clock', 0.0), q[order], velocity[order]
+        if self.world.dynamics is not None:
+            stamp += self._rng.normal(0.0, self.world.dynamics.jitter_s)
         if 'frozen' in faults and self._last is not None:
             _, names, q, velocity = self._last
         self._last = stamp, names, q, velocity

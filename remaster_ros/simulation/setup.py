@@ -16,6 +16,7 @@ import yaml
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.workcell import Workcell, config_path
+from remaster_ros.simulation.dynamics import Dynamics
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import model_of_tour
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
@@ -85,6 +86,7 @@ def make_world(
     rate: float,
     hidden: Sequence[EffectSpec] = (),
     candidates: int = PRACTICE_CANDIDATES,
+    dynamics: float = 0.0,
 ) -> World:
     """Random hidden World for a cell; its time begins now.
 
@@ -103,6 +105,9 @@ def make_world(
         Hidden effects of the arm or the sensors.
     candidates
         Number of candidate poses of each split; the size of a hidden effect depends on them.
+    dynamics
+        Scale of the arm's hidden dynamics, 1 for sizes of real machines; 0: the encoders see all
+        of its motion, and frames are sent at the time that they show.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain()
@@ -149,6 +154,9 @@ def make_world(
             cell.robot.tip_link,
             _start(chain, np.deg2rad(settings['start_q_deg'])),
             cell.link_radius_m,
+            Dynamics.drawn(chain, tuple(sensors), dynamics, np.random.default_rng([seed, 4]))
+            if dynamics
+            else None,
         ),
     )
 

@@ -30,6 +30,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.files import write_atomically
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import Motion, ServoPoint
+from remaster_ros.simulation.dynamics import CameraTiming, Dynamics, LinkSide
 from remaster_ros.simulation.faults import Faults, Numbers, in_outage
 from remaster_ros.simulation.hidden_arm import TrueArm
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
@@ -55,13 +56,14 @@ class WorldContent:
     tip_link: str | None
     start_q: FloatArray  # Reported joint positions at the beginning, rad or m, (k,)
     link_radius_m: float  # Radius of the links that can hide a marker from a sensor
+    dynamics: Dynamics | None = None  # None: the encoders see all of the arm's motion
 
 
 class World:
     """True arm in front of the true sensors.
 
     Made by `create` (the demo) or `open` (a fake); see the module's docstring. A fake sensor uses
-    only `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`,
+    only `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `camera`,
     `warming_k`, `is_moving` and `joint_speed`, so that its tests need no arm.
     """
 
@@ -74,6 +76,10 @@ class World:
         self.start_q = content.start_q
         self._motion = Motion(START_S, self.start_q)
         self._wrong = TrueArm(self.chain, self.truth, START_S, self.start_q)
+        self.dynamics, self._link = content.dynamics, None
+        if content.dynamics is not None:
+            offsets = self.truth.joint_offsets
+            self._link = LinkSide(self.chain, content.dynamics, offsets, START_S)
         self._faults = Faults(folder)
         self._lines: TextIO | None = None
         self._torn = ''
@@ -160,6 +166,8 @@ class World:
                 end_s, end = start_s + waypoints[-1].time_s, waypoints[-1].q
                 self._wrong.move(start_s, self._motion.at(start_s)[0], end_s, end)
                 reference = None if now is None else (np.array(now[0]), np.array(now[1]))
+                if self._link is not None:
+                    self._link.advance(self._motion, start_s)
                 self._motion.follow(start_s, waypoints, reference)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
@@ -167,6 +175,17 @@ class World:
         with self._lock:
             self._read_motions()
             return self._motion.at(t)
+
+    def encoders(self, t: float) -> FloatArray:
+        """Joint positions that a report of time t has, each late by its joint's lag, (k,)."""
+        if self.dynamics is None:
+            return self.reported(t)[0]
+        late = t - self.dynamics.lag_s
+        return np.array([self.reported(at)[0][joint] for joint, at in enumerate(late.tolist())])
+
+    def camera(self, sensor: str) -> CameraTiming | None:
+        """Times of a camera's frames; None if a frame is sent at the time that it shows."""
+        return None if self.dynamics is None else self.dynamics.cameras.get(sensor)
 
     def joint_speed(self, t: float) -> float:
         """Largest joint speed at time t, rad/s; 0.25 m/s of a slide count as 1 rad/s."""
@@ -187,14 +206,20 @@ class World:
 
         The fault ``swapped`` applies to the first marker only.
         """
-        self._sensor(sensor)
-        q = self.reported(t)[0]
+        seen_by = self._sensor(sensor)
+        q, shift = self.reported(t)[0], None
+        if self._link is not None:
+            with self._lock:
+                added, shift = self._link.at(self._motion, t)
+            q = q + added
         if self.truth.effects:
             with self._lock:
                 marker_N = self._wrong.marker_in_sensor(sensor, t, q, marker)
         else:
             # Without effects the same position, computed several times as fast.
             marker_N = self.truth.without_noise(self.chain, sensor, q, marker)
+        if shift is not None:
+            marker_N = marker_N + shift @ seen_by.T_R_N[:3, :3]
         faults = self.faults(sensor)
         if not marker:
             marker_N[0] += faults.get('swapped', 0.0)

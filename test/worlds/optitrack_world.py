@@ -41,6 +41,9 @@ class MarkerWorld:
     def line_of_sight(self, sensor: str, t: float) -> bool:
         return self.visible
 
+    def camera(self, sensor: str) -> None:
+        """Frames are sent at the time that they show."""
+
     def faults(self, device: str) -> dict[str, float]:
         return self.faulty
 

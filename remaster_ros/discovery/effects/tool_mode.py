@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from remaster_ros.calibration.dynamics import MODES
 from remaster_ros.discovery.effects.base import Candidate, Design, Effect, displaced, needs_motion
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.sizes import number
@@ -14,18 +15,18 @@ from remaster_ros.types import FloatArray
 
 def candidates(context: Context) -> Iterator[Candidate]:
     """The tool as a whole: δp = -R diag(m) R' a, one m for each axis of the tool."""
-    yield EFFECT.candidate(_swung, [f'tool_mode_{axis}' for axis in 'xyz'])
+    yield EFFECT.candidate(_swung, MODES)
 
 
 def _swung(context: Context) -> Design:
-    """Columns of the marker displaced by the tool's swing, one for each axis of the swing."""
-    swing = context.motion.swing(context.markers[context.marker])
-    return displaced(*(swing[:, :, axis] for axis in range(3)))
+    """Columns of the marker displaced by the tool's swing."""
+    swing = context.motion.swing(context.markers.mean(axis=0))
+    return displaced(*(swing[:, :, column] for column in range(len(MODES))))
 
 
 def _frequency(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     """Phrase for the frequency, Hz, of the tool's softest axis."""
-    axis = int(np.argmax(draws.mean(axis=0)))
+    axis = int(np.argmax(draws[:, :3].mean(axis=0)))
     softest = np.maximum(draws[:, axis], 1e-7)
     hertz = 1.0 / (2.0 * np.pi * np.sqrt(softest))
     shown = number(float(hertz.mean()), float(hertz.std()), ' Hz')
@@ -37,7 +38,8 @@ EFFECT = Effect(
     place='marker',
     driver='acceleration',
     form='linear',
-    equation="δp = −R_T diag(m) R_T' a, m = 1/(2πf)², far below the mode's frequency f",
+    equation="δp = −R_T diag(m) R_T' a, m = 1/(2πf)², far below the mode's frequency f; "
+    'a of the tool frame, and a share of that from there to the markers',
     source='Inman 2014, Engineering Vibration: base excitation below resonance',
     unit='s²',
     plausible=(1e-6, 5e-4),
