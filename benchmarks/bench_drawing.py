@@ -21,7 +21,7 @@ from common import table
 import remaster_ros
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.fit_json import uncertainty
+from remaster_ros.reports.loadable import uncertainty
 from remaster_ros.types import BoolArray, FloatArray, Priors, Session
 
 FIRST_SEED = 500

@@ -37,7 +37,7 @@ class Fit(FitResult):
 
         ``joint_offsets_std`` is that of an arm that is exactly its drawing.
         """
-        from remaster_ros.reports.fit_json import uncertainty
+        from remaster_ros.reports.loadable import uncertainty
 
         return uncertainty(self).std
 

@@ -21,8 +21,9 @@ from remaster_ros.discovery.decision import Named, decisions
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.errors import InsufficientDataError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.discovery_json import earlier_pairs, read_discovery
+from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import DISCOVERY_FILE
+from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.result_folder import prepare_folder, save_discovery
 from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import undone_on_failure

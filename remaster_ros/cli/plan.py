@@ -22,7 +22,7 @@ from remaster_ros.planning.collection_plan import CollectionPlan, plan_collectio
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
-from remaster_ros.reports.discovery_json import read_causes
+from remaster_ros.reports.found_causes import read_causes
 from remaster_ros.reports.plan_json import plan_text, plan_to_dict
 from remaster_ros.reports.plan_page import check_plan_page, plan_page, write_plan_page
 from remaster_ros.reports.robot_scene import robot_scene

@@ -361,7 +361,8 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
         One line naming the file, the place in it and the remedy.
     """
     path = Path(path)
-    return of_text(read_limited(path, FILE_LIMIT, REMEDY), path)
+    hint = 'give apply/compensation.json that fit or discover has written'
+    return of_text(read_limited(path, FILE_LIMIT, hint), path)
 
 
 def of_text(data: bytes, path: Path) -> Compensation:

@@ -48,7 +48,8 @@ from remaster_ros.nodes.status import (
     Summary,
     listen,
 )
-from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit, uncertainty
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
+from remaster_ros.reports.loadable import uncertainty
 from remaster_ros.reports.precision_json import precision_json
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.priors_file import read_priors
@@ -251,7 +252,7 @@ class Optimizer(RemasterNode):
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
-        from remaster_ros.reports.discovery_json import earlier_pairs
+        from remaster_ros.reports.found_causes import earlier_pairs
         from remaster_ros.reports.result_folder import save_discovery
 
         out = Path(self.p.discovery)

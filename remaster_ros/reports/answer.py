@@ -31,12 +31,7 @@ from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.words import clock_time
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.fit_json import (
-    DISCOVERY_FILE,
-    FIT_FILE,
-    FIT_LIMIT,
-    read_fit,
-)
+from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, FIT_LIMIT, read_fit
 from remaster_ros.reports.rows_csv import (
     AFTER,
     BEFORE,

@@ -24,7 +24,7 @@ from remaster_ros.calibration.predictive_accuracy import predicted_accuracy, too
 from remaster_ros.discovery.effects.drivers import driver_named
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.fit_json import uncertainty
+from remaster_ros.reports.loadable import uncertainty
 from remaster_ros.reports.rows_csv import lengths_mm
 from remaster_ros.types import BoolArray, FloatArray, IntArray
 

@@ -1,43 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Content of fit.json (format ``remaster-fit/1``), and the correction of a fit."""
+"""Content of fit.json (format ``remaster-fit/1``)."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, structs
 
-from remaster_ros.calibration.predictions import predict
-from remaster_ros.calibration.priors import DRAWING_TAILS
 from remaster_ros.calibration.records import Robot
-from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.export import (
     APPLY_FOLDER,
     MODEL_FILE,
-    URDF_FILE,
-    calibrated_urdf,
-    exports,
 )
-from remaster_ros.compensation.file import COMPENSATION_FILE, of_text, written
-from remaster_ros.compensation.loaded_errors import errors_with_correction, errors_with_urdf
-from remaster_ros.compensation.of_result import (
-    CorrectedArm,
-    arm_of_geometry,
-    arm_of_offsets,
-    mounts_of,
-)
-from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
+from remaster_ros.discovery.geometry_model import GeometryModel
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
+from remaster_ros.reports.loadable import geometry_of, uncertainty
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
@@ -110,90 +95,6 @@ def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]
         row |= {f'{name}_{unit}': scale * values[joint] for name, values in columns.items()}
         rows.append(row)
     return rows
-
-
-@lru_cache(maxsize=2)
-def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Lengths and tilts estimated from a fit's session; None without an estimate."""
-    if result.found is None:
-        return None
-    geometry = geometry_model(result.found)
-    if geometry is None:
-        return None
-    gross = [row for check in result.noise_checks for row in check.gross]
-    # Each figure is that of the file which is loaded.
-    left_out = [observation for observation, _ in result.left_out]
-    drawn = errors_with_urdf(result.session, exports(result)[URDF_FILE], left_out)
-    loaded = errors_with_urdf(result.session, model_text(result, geometry), left_out)
-    return replace(geometry.beside(result, gross), errors=loaded, drawing_errors=drawn)
-
-
-class Uncertainty(NamedTuple):
-    """Uncertainty of the zero-offsets of k joints; rad, m for prismatic joints."""
-
-    std: FloatArray  # (k,)
-    interval95: FloatArray  # (k, 2)
-
-
-def uncertainty(result: FitResult) -> Uncertainty:
-    """Uncertainty of a fit's offsets as it is shown, for an arm that is not exactly its drawing.
-
-    Lengths and tilts within the tolerance of the drawing may change an offset without any
-    residual. Without an estimate of them, and for offsets that are not identifiable, it is the
-    uncertainty of an arm that is exactly its drawing.
-    """
-    drawn = Uncertainty(result.joint_offsets_std, result.joint_offsets_interval95)
-    geometry = geometry_of(result)
-    if geometry is None:
-        return drawn
-    moved = DRAWING_TAILS * np.linalg.norm(geometry.offset_moves, axis=1)
-    std = np.where(result.identifiable, np.hypot(drawn.std, moved), drawn.std)
-    mean, times = result.joint_offsets[:, None], (std / drawn.std)[:, None]
-    return Uncertainty(std, mean + times * (drawn.interval95 - mean))
-
-
-def model_text(result: FitResult, geometry: GeometryModel) -> str:
-    """URDF with lengths, tilts and offsets fitted together."""
-    remark = (
-        f'Load this model in place of {URDF_FILE}, never beside another correction: lengths, '
-        'tilts and zero-offsets were fitted together.'
-    )
-    if geometry.judged.any():
-        remark += (
-            f' Mean error on held-out poses: {1e3 * geometry.held_out_m:.3f} mm, with the '
-            f'zero-offsets alone {1e3 * geometry.drawing_held_out_m:.3f} mm.'
-        )
-    offsets = np.where(result.identifiable, geometry.joint_offsets, 0.0)
-    return calibrated_urdf(
-        result.session.urdf,
-        result.chain,
-        offsets,
-        [remark],
-        Geometry(*(np.vstack((v, np.zeros(3))) for v in (geometry.shifts, geometry.turns))),
-    )
-
-
-def compensation_text(result: FitResult, result_sha256: str) -> str:
-    """compensation.json of a fit, with lengths and tilts if a commanded arm gains by them.
-
-    Near singularities no command reaches the poses that they require; a robot model with them
-    needs none.
-    """
-    geometry, rows = geometry_of(result), result.measurements
-    described = None if geometry is None else arm_of_geometry(result, geometry, rows)
-    if described is not None and geometry is not None:
-        text = _of_fit(described, result, result_sha256)
-        model = of_text(text.encode(), Path(COMPENSATION_FILE)).model
-        if replace(geometry, errors=errors_with_correction(model, rows)).is_better:
-            return text
-    alone = arm_of_offsets(result, predict(result, rows).widening, geometry=described)
-    return _of_fit(alone, result, result_sha256)
-
-
-def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
-    """compensation.json of a corrected arm of a fit."""
-    described = replace(described, mounts=mounts_of(result, described.model))
-    return written(described, result.session, 'fit', result_sha256)
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:

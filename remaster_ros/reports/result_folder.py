@@ -19,13 +19,10 @@ from remaster_ros.reports.fit_json import (
     FORMATS,
     REPORT_FILE,
     WRITTEN,
-    compensation_text,
     fit_content,
-    geometry_of,
-    model_text,
     require_own,
-    uncertainty,
 )
+from remaster_ros.reports.loadable import compensation_text, geometry_of, model_text, uncertainty
 from remaster_ros.reports.rows_csv import (
     PREDICTIONS_FILE,
     RESIDUALS_FILE,
@@ -143,7 +140,8 @@ def save_discovery(
         The folder cannot be written to.
     """
     # `fit` does not need what discovers.
-    from remaster_ros.reports.discovery_json import applied, discovery_content, predictions_of
+    from remaster_ros.reports.discovery_json import discovery_content, predictions_of
+    from remaster_ros.reports.loadable import applied
 
     folder = Path(folder)
     make_folder(folder)

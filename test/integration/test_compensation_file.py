@@ -21,8 +21,8 @@ from remaster_ros.compensation.file import written
 from remaster_ros.compensation.of_result import arm_of_effects, arm_of_geometry, arm_of_offsets
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse
-from remaster_ros.reports.discovery_json import compensation_of, holds_everything, predictions_of
-from remaster_ros.reports.fit_json import geometry_of
+from remaster_ros.reports.discovery_json import predictions_of
+from remaster_ros.reports.loadable import compensation_of, geometry_of, holds_everything
 from remaster_ros.reports.result_folder import save_discovery, save_fit
 from remaster_ros.types import Correction
 

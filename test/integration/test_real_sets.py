@@ -14,12 +14,8 @@ from remaster_ros.calibration.fit import FitResult, fit_session
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.controller_forms import form_content
 from remaster_ros.discovery.discover import discover_session
-from remaster_ros.reports.discovery_json import (
-    compensation_of,
-    predictions_of,
-    read_discovery,
-)
-from remaster_ros.reports.fit_json import compensation_text, geometry_of
+from remaster_ros.reports.discovery_json import predictions_of, read_discovery
+from remaster_ros.reports.loadable import compensation_of, compensation_text, geometry_of
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.reports.sentences import load_words
 from remaster_ros.session.reader import read_session

@@ -19,7 +19,8 @@ from worlds.hidden_sessions import Recipe, hidden_session, third_visits
 import remaster_ros
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.of_result import arm_of_offsets
-from remaster_ros.reports.discovery_json import compensation_of, predictions_of
+from remaster_ros.reports.discovery_json import predictions_of
+from remaster_ros.reports.loadable import compensation_of
 
 ARMS = int(os.environ.get('COMPENSATED_ARMS', '20'))
 WORKERS = int(os.environ.get('COMPENSATED_WORKERS', '2'))

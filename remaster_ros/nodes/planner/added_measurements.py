@@ -48,8 +48,8 @@ class AddedMeasurements:
         if self._journal.tour is not None and self._journal.tour.inspection:
             return 'it was no calibration; name a new session folder', None
         # Imported when needed, since the import is slow.
-        from remaster_ros.reports.discovery_json import read_causes
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
+        from remaster_ros.reports.found_causes import read_causes
 
         path = Path(self._discovery) / DISCOVERY_FILE
         if not self._discovery or not path.exists():

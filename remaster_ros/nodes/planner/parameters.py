@@ -116,7 +116,7 @@ class Parameters(InspectionParameters):
         if not self.separate:
             return ()
         # Imported when needed, since the import is slow.
-        from remaster_ros.reports.discovery_json import read_causes
+        from remaster_ros.reports.found_causes import read_causes
 
         return read_causes(self.separate, joint_names)
 

@@ -9,7 +9,8 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery import explain
 from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.geometry_model import geometry_model
-from remaster_ros.reports.discovery_json import discovery_content, loadable
+from remaster_ros.reports.discovery_json import discovery_content
+from remaster_ros.reports.loadable import loadable
 from remaster_ros.reports.sentences import discovery_lines
 
 

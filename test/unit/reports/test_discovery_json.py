@@ -28,8 +28,9 @@ from remaster_ros.discovery.gain import Gain
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports import discovery_json, figures
-from remaster_ros.reports.discovery_json import discovery_content, loadable, read_discovery
-from remaster_ros.reports.fit_json import model_text
+from remaster_ros.reports import loadable as loadables
+from remaster_ros.reports.discovery_json import discovery_content, read_discovery
+from remaster_ros.reports.loadable import loadable, model_text
 from remaster_ros.reports.report import discovery_html
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.reports.schemas import Discovered
@@ -347,16 +348,16 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
         loads_geometry=True,
     )
     model = SimpleNamespace(largest_slope=lambda: 0.1)
-    monkeypatch.setattr(discovery_json, 'arm_of_effects', lambda *_: SimpleNamespace(model=model))
+    monkeypatch.setattr(loadables, 'arm_of_effects', lambda *_: SimpleNamespace(model=model))
     left = {'offsets': 2.0 * errors, 'geometry': errors, 'everything': 0.9999 * errors}
-    monkeypatch.setattr(discovery_json, 'errors_to_load', lambda _: left)
+    monkeypatch.setattr(loadables, 'errors_to_load', lambda _: left)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
     assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')
     # What the reader of the file refuses is not offered, however well it predicts.
     assert results[-1].file.endswith('compensation.json')
     model.largest_slope = lambda: 1.5
-    discovery_json._arm_with_effects.cache_clear()
+    loadables._arm_with_effects.cache_clear()
     assert loadable(found)[-1].file == ''
 
 

@@ -23,7 +23,8 @@ from remaster_ros.compensation.export import (
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
-from remaster_ros.reports.fit_json import fit_content, geometry_of, joint_offsets_of, read_fit
+from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
+from remaster_ros.reports.loadable import geometry_of
 from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.reports.sentences import fit_lines

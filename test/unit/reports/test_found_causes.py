@@ -8,7 +8,7 @@ from worlds.discovery_files import discovery_content, effect, look_alike
 
 from remaster_ros.discovery.decision import Named
 from remaster_ros.errors import InputError
-from remaster_ros.reports.discovery_json import earlier_pairs, read_causes
+from remaster_ros.reports.found_causes import earlier_pairs, read_causes
 
 
 def written(folder, *look_alikes, **more):
