@@ -110,6 +110,36 @@ def test_an_offset_without_its_std_is_refused(fit_result):
         joint_offsets_of(fit, fit_result.chain)
 
 
+def test_a_file_with_the_keys_of_the_contract_alone_is_read(fit_result, tmp_path):
+    """Other programs write no more; each record fills in the rest."""
+    fit = msgspec.to_builtins(fit_content(fit_result))
+    kept = {
+        'joint_offsets': 'joint mean_deg std_deg interval95_deg identifiable why',
+        'registration': 'translation_m rotation_xyzw std_m std_rad',
+        'markers': 'position_m std_m',
+        'noise': 'sigma_m std_m pose_sigma_m',
+        'sampler': 'name chains draws r_hat_max ess_min seconds',
+    }
+
+    def only(part, keys):
+        if isinstance(part, list):
+            return [only(one, keys) for one in part]
+        if keys[0] in part:
+            return {key: part[key] for key in keys}
+        return {name: only(one, keys) for name, one in part.items()}
+
+    plain = {key: only(fit[key], keys.split()) for key, keys in kept.items()}
+    plain |= {key: fit[key] for key in ('format', 'gauge', 'accuracy', 'left_out')}
+    (tmp_path / 'fit.json').write_text(json.dumps(plain))
+    read = read_fit(tmp_path / 'fit.json')
+    assert msgspec.to_builtins(read.noise) == plain['noise']
+    assert (read.sampler.method, read.sampler.precision) == ('metropolis', None)
+    np.testing.assert_array_equal(
+        joint_offsets_of(read, fit_result.chain)[0],
+        joint_offsets_of(fit_content(fit_result), fit_result.chain)[0],
+    )
+
+
 @pytest.mark.parametrize(
     ('key', 'value'),
     [
