@@ -127,7 +127,7 @@ def supply(word: str, readers_files: Path, here: Path) -> None:
         shutil.copy(readers_files / name, target)
     elif name in ('my_session', 'session', 'other_session', 's1', 's2', 'saggy'):
         # A cause so small that it has look-alikes, which `plan --separate` needs.
-        options = '--poses 24 --validation 12 --effect joint_compliance@2:0.15 --quiet'
+        options = '--poses 24 --validation 12 --effect joint_compliance@2:0.1 --quiet'
         # The second session is another one; the first has the same data by whatever name.
         seed = '5' if name in ('other_session', 's2') else '0'
         assert main(['simulate', name, '--seed', seed, *options.split()]) == 0
