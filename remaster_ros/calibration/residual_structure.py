@@ -296,8 +296,10 @@ def _f_test(
 
 def _from_pose_to_pose(
     remainder: FloatArray, basis: FloatArray, rows: Rows, seconds: FloatArray
-) -> StructureTest:
+) -> StructureTest | None:
     """Test whether the mean error of a pose resembles that of the pose before.
+
+    None if the model's parameters leave fewer than two numbers.
 
     The remainder is M e with a projection M. Of the ratio e' M A M e / e' M e, A being half the
     sum of both neighbours, mean and variance follow from traces; its distribution is nearly a beta
@@ -320,6 +322,8 @@ def _from_pose_to_pose(
     along = shifted(basis)
     small = basis.T @ along
     freedom = len(remainder) - basis.shape[1]
+    if freedom < 2:
+        return None
     first = -float(np.trace(small))
     second = 1.5 * int(np.sum(neighbours)) - 2.0 * np.sum(along**2) + np.sum(small * small.T)
     mean = first / freedom

@@ -297,7 +297,7 @@ def written(described: CorrectedArm, session: Session, made_by: Source, result_s
         'temperature': temperature if model.grows else None,
         'controller': session.controller,
         'on_tool': described.mounts
-        or {sensor: Mount(session.sensors[sensor]) for sensor in session.on_tool},
+        or {sensor: Mount(session.sensors[sensor]) for sensor in sorted(session.on_tool)},
     }
     encode = msgspec.json.Encoder(enc_hook=plain).encode
     lines = [f'  "{key}": {encode(value).decode()}' for key, value in content.items()]

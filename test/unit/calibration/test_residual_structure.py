@@ -15,6 +15,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.residual_structure import ResidualStructure, residual_structure
 from remaster_ros.calibration.result import robust_std
 from remaster_ros.calibration.smooth_functions import MOST_ROWS, spread_poses
+from remaster_ros.session.together import together
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.types import FloatArray, Measurements, Session
 
@@ -145,6 +146,17 @@ def test_few_poses_and_readings_without_noise_are_not_judged() -> None:
     assert structure_of(scene(82, poses=8)[0]) == ResidualStructure((), too_few=True)
     exact = with_errors(84, lambda m, rng: np.zeros((len(m), 3)))
     assert structure_of(exact) == ResidualStructure(())
+
+
+def test_means_that_the_parameters_take_up_whole_are_not_judged() -> None:
+    """Six poses in two sessions: twelve means of sensors, with registrations for each session."""
+    session, _ = scene(7, poses=6, sensor_count=2)
+    m = session.measurements
+    parts = [replace(session, measurements=m.select(m.pose % 2 == odd)) for odd in (0, 1)]
+    both, _ = together([('a', parts[0]), ('b', parts[1])])
+    tests = structure_of(both).tests
+    assert not any(test.between_poses and test.driver == 'reading_before' for test in tests)
+    assert all(0.0 <= test.p_value <= 1.0 for test in tests)
 
 
 def test_poses_of_one_solution_are_judged_by_their_means() -> None:
