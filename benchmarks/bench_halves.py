@@ -1,10 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do two halves of one session agree as well as their stated standard deviations say?
+"""Do two halves of one session tell the same causes, and offsets that differ as they may?
 
 Each set beside this repository is split at random into halves that share no pose; both go through
-`remaster discover`, and what either finds is compared: RMS of the differences over the stated
-standard deviations, 1 where these are right. Each split is a line of the results file, so that the
-benchmark can be stopped and goes on where it was.
+`remaster discover`. Two figures of each set:
+
+- of the causes that one half has with a probability of 0.95 or more, joint by joint, the share
+  that have 0.5 or more in the other half, by whatever name they stand in its models;
+- RMS of the differences of the zero-offsets over the standard deviations of these differences, 1
+  where those are right.
+
+Halves are of one arm: what only the prior decides cancels. With y = A φ + e in a half, φ all
+parameters of both halves' models (of the arm, and the same in both), V their variance before the
+data, and K the estimator of a half by its own model, the offsets differ by (K₁A₁ − K₂A₂) φ +
+K₁e₁ − K₂e₂, so that::
+
+    Var(δ₁ − δ₂) = (K₁A₁ − K₂A₂) V (K₁A₁ − K₂A₂)' + K₁WK₁' + K₂WK₂' + M₁M₁' + M₂M₂'
+
+with M the moves from each half's best model to its others. V has the lengths and tilts of a
+drawing's tolerance, too. Beside it stands the same with the standard deviations that fit.json
+states, which contain what only the prior decides. Each split is a line of the results file, so
+that the benchmark can be stopped and goes on where it was.
 
     python benchmarks/bench_halves.py                       ten splits of four sets, on all cores
     python benchmarks/bench_halves.py --only panda_left --splits 1
@@ -14,21 +29,28 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import time
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from common import ROOT, known, resumed, table
 
-from remaster_ros.calibration.result import FitResult
-from remaster_ros.discovery.discover import discover_session
+from remaster_ros.calibration.priors import DRAWING_TAILS, prior_rows
+from remaster_ros.discovery import discover
+from remaster_ros.discovery.effects.base import Candidate
+from remaster_ros.discovery.effects.registry import EFFECTS
+from remaster_ros.discovery.random_effects import kinds
+from remaster_ros.discovery.residuals import Residuals
+from remaster_ros.discovery.solution import Solution
+from remaster_ros.discovery.unmodelled import Unmodelled
+from remaster_ros.discovery.walk import Walk, at_any_time
 from remaster_ros.session.reader import read_session
+from remaster_ros.types import FloatArray, Session
 
 SETS = ('panda_left', 'meca500_repeats', 'ur10_two_solutions', 'ur10_iso_cubes')
-# Lengths and tilts of joints, by the names of their parameters.
-GEOMETRY = re.compile(r'(length|offset_[xyz]|tilt_[xyz])_\d+')
+SURE, LIKELY = 0.95, 0.5
 
 
 class Split(NamedTuple):
@@ -36,6 +58,137 @@ class Split(NamedTuple):
 
     folder: str
     seed: int
+
+
+class Half(NamedTuple):
+    """What was found in a half."""
+
+    found: discover.Discovery
+    unmodelled: Unmodelled  # Normal equations of its best model
+    moves: FloatArray  # Of all parameters to its other models, (size, models)
+    probability: dict[str, float]  # Of each cause that some model has
+
+
+def half_of(session: Session, seed: int) -> Half:
+    """Discover a half of a session."""
+    equations: list[Unmodelled] = []
+    moves: list[FloatArray] = []
+    probability: dict[str, float] = {}
+    describe = discover.describe
+
+    class Kept(Unmodelled):
+        """Normal equations that are kept."""
+
+        def by_models(self, *args: Any) -> FloatArray:
+            equations.append(self)
+            moves.append(super().by_models(*args))
+            return moves[-1]
+
+    def noted(walk: Walk, *args: Any) -> Any:
+        for key, chance in walk.probability.items():
+            probability[_text(key)] = float(chance)
+        return describe(walk, *args)
+
+    with patch.object(discover, 'Unmodelled', Kept), patch.object(discover, 'describe', noted):
+        found = discover.discover_session(session, rng=np.random.default_rng(seed))
+    # The last one is that of the model that is returned.
+    return Half(found, equations[-1], moves[-1], probability)
+
+
+def _text(key: tuple[Any, ...]) -> str:
+    name, joints, *_, subject, change = key
+    return ' '.join(part for part in (name, ','.join(map(str, joints)), subject, change) if part)
+
+
+def sure_of(half: Half) -> list[str]:
+    """Return the causes that a half states with a probability of `SURE`, joint by joint."""
+    stated = [
+        _text(at_any_time(candidate))
+        for effect, group in zip(half.found.effects, half.found.groups, strict=False)
+        if (effect.probability or 0.0) >= SURE
+        for candidate in group
+    ]
+    return [*dict.fromkeys(key for key in stated if half.probability.get(key, 0.0) >= SURE)]
+
+
+def difference_std(halves: list[Half]) -> FloatArray:
+    """Return the standard deviation of the difference of the zero-offsets of two halves, (k,)."""
+    joints = len(halves[0].found.fit.joint_offsets)
+    shared, variance = _shared(halves)
+    total = np.zeros(joints)
+    responses = []
+    for half in halves:
+        one = half.unmodelled
+        rows = np.full(joints, -1)
+        mine = one.where < joints
+        rows[one.where[mine]] = np.flatnonzero(mine)
+        estimator = (one.root[rows] @ one.root.T) @ one.white.T
+        columns = one.data.columns(shared)
+        white = one.data.noise_model.whitened(columns, one.solution.noise)
+        free = one.found.posterior.free
+        base = one.white[:, : len(free)]
+        responses.append(
+            np.concatenate((estimator @ base, estimator @ white.reshape(len(base), -1)), axis=1)
+        )
+        total += np.sum(estimator**2, axis=1) + np.sum(half.moves[:joints] ** 2, axis=1)
+    differs = responses[0] - responses[1]
+    return np.sqrt(total + np.einsum('ij,jk,ik->i', differs, variance, differs))
+
+
+def _shared(halves: list[Half]) -> tuple[list[Candidate], FloatArray]:
+    """Return the causes that either half's model has, and the variance of all parameters.
+
+    Those of the offsets model first: what has a flat prior is in both halves as it is, and has no
+    variance here.
+    """
+    one = halves[0].unmodelled
+    x = one.found.model.natural(one.found.mode.z)
+    free = one.found.posterior.free
+    rows = prior_rows(one.found.model, one.found.posterior.priors, x, natural=True)[1][:, free]
+    blocks = [np.linalg.pinv(rows.T @ rows, rcond=1e-10)]
+    shared: list[Candidate] = []
+    names: set[str] = set()
+    for half in halves:
+        for candidate, variance in _variances(half.unmodelled.solution):
+            if names.isdisjoint(candidate.parameters):
+                shared.append(candidate)
+                blocks.append(variance)
+                names |= {*candidate.parameters}
+    for candidate, variance in _of_drawing(
+        one.data, one.found.problem.priors.geometry_tolerance_m
+    ):
+        if names.isdisjoint(candidate.parameters):
+            shared.append(candidate)
+            blocks.append(variance)
+    edges = np.cumsum([0, *(len(block) for block in blocks)])
+    together = np.zeros((edges[-1], edges[-1]))
+    for block, start, stop in zip(blocks, edges[:-1], edges[1:], strict=True):
+        together[start:stop, start:stop] = block
+    return shared, together
+
+
+def _variances(solution: Solution) -> list[tuple[Candidate, FloatArray]]:
+    precision = solution.prior_precision()
+    return [
+        (candidate, np.linalg.pinv(precision[where, where], rcond=1e-10, hermitian=True))
+        for candidate, where in zip(solution.candidates, solution.slices(), strict=True)
+    ]
+
+
+def _of_drawing(data: Residuals, tolerance_m: float) -> list[tuple[Candidate, FloatArray]]:
+    candidates = [
+        candidate
+        for effect in EFFECTS.values()
+        if effect.place in ('link_translation', 'link_rotation')
+        if not effect.needs(data.context)
+        for candidate in effect.candidates(data.context)
+        if candidate.model_change is not None
+    ]
+    return [
+        (member, (DRAWING_TAILS * tolerance_m) ** 2 * mapping @ mapping.T)
+        for family in kinds(data, candidates)
+        for member, mapping in zip(family.members, family.maps, strict=True)
+    ]
 
 
 def run(item: tuple[str, Split]) -> dict[str, Any]:
@@ -48,31 +201,24 @@ def run(item: tuple[str, Split]) -> dict[str, Any]:
     halves = []
     for part in np.array_split(poses, 2):
         rows = np.flatnonzero(np.isin(session.measurements.pose, part))
-        halves.append(discover_session(session.select(rows), rng=np.random.default_rng(seed)))
-    one, other = (found.fit for found in halves)
+        halves.append(half_of(session.select(rows), seed))
+    seconds = time.process_time() - started
+    one, other = (half.found.fit for half in halves)
     both = one.identifiable & other.identifiable
-    std = np.hypot(one.joint_offsets_std, other.joint_offsets_std)
-    offsets = ((one.joint_offsets - other.joint_offsets) / std)[both]
-    mine, theirs = _geometry(one), _geometry(other)
-    shared = [
-        (mine[key][0] - theirs[key][0]) / float(np.hypot(mine[key][1], theirs[key][1]))
-        for key in mine.keys() & theirs.keys()
+    apart = (one.joint_offsets - other.joint_offsets)[both]
+    stated = np.hypot(one.joint_offsets_std, other.joint_offsets_std)[both]
+    again = [
+        [key, mine.probability[key], theirs.probability.get(key, 0.0)]
+        for mine, theirs in (halves, halves[::-1])
+        for key in sure_of(mine)
     ]
     return {
         'name': name,
-        'offsets': offsets.tolist(),
-        'geometry': shared,
-        'in_one_half_only': len(mine.keys() ^ theirs.keys()),
-        'seconds': time.process_time() - started,
-    }
-
-
-def _geometry(fit: FitResult) -> dict[str, tuple[float, float]]:
-    """Return value and standard deviation of the lengths and tilts of a fit."""
-    return {
-        name: (value, std)
-        for name, value, std in zip(fit.theta_names, fit.theta, fit.theta_std, strict=True)
-        if GEOMETRY.fullmatch(name)
+        'offsets': (apart / difference_std(halves)[both]).tolist(),
+        'stated': (apart / stated).tolist(),
+        'causes': again,
+        'verdicts': [half.found.verdict for half in halves],
+        'seconds': seconds,
     }
 
 
@@ -101,26 +247,32 @@ def main() -> None:
     for line in resumed(args.results, todo, run, args.jobs):
         done[line['name']] = line
         print(line['name'], f'{line["seconds"]:.0f} s', flush=True)
-    rows = []
+    rows, gone = [], []
     for name in args.only:
         lines = [done[f'{name}-{seed}'] for seed in range(args.splits)]
-        together = {
-            key: [value for line in lines for value in line[key]]
-            for key in ('offsets', 'geometry')
-        }
-        alone = sum(line['in_one_half_only'] for line in lines)
-        seconds = float(np.median([line['seconds'] for line in lines]))
+        causes = [cause for line in lines for cause in line['causes']]
+        again = sum(chance >= LIKELY for _, _, chance in causes)
+        gone += [(name, key, f'{chance:.2f}') for key, _, chance in causes if chance < LIKELY]
         rows.append(
             [
                 f'`{name}`, {args.splits}',
-                _rms(together['offsets']),
-                _rms(together['geometry']),
-                alone,
-                f'{seconds:.0f}',
+                f'{again} of {len(causes)}'
+                + (f' ({100 * again / len(causes):.0f} %)' if causes else ''),
+                _rms([value for line in lines for value in line['offsets']]),
+                _rms([value for line in lines for value in line['stated']]),
+                f'{np.median([line["seconds"] for line in lines]):.0f}',
             ]
         )
-    header = ('set, splits', 'zero-offsets', 'lengths and tilts', 'in one half only', 'CPU s')
+    header = (
+        'set, splits',
+        'causes of one half in the other',
+        'offsets, by the variance of the difference',
+        'by the stated std',
+        'CPU s',
+    )
     print(table(header, rows))
+    print()
+    print(table(('set', 'not in the other half', 'probability there'), gone))
 
 
 if __name__ == '__main__':

@@ -294,16 +294,20 @@ class NoiseModel:
 
     def sums_of_squares(self, errors: FloatArray) -> FloatArray:
         """Sum of squares in each error group, m², of errors (..., n, 3)."""
+        # The rows first, in memory too: each sum is over long rows.
+        values = np.moveaxis(errors.reshape(-1, *errors.shape[-2:]), 0, -1)
+        values = np.ascontiguousarray(values)
         if self.frames is not None:
-            errors = np.einsum('nij,...nj->...ni', self.frames, errors)
-        values = self.rows.decorrelated(np.moveaxis(errors, (-2, -1), (0, 1)))
-        sums = np.zeros((*errors.shape[:-2], len(self.error_groups)))
+            values = self.frames @ values
+        values = self.rows.decorrelated(values)
+        sums = np.zeros((len(self.error_groups), values.shape[2]))
         for index, part in self._parts(self.rows, values, 0):
-            sums[..., index] = np.einsum('ni...,ni...->...', part, part)
+            flat = part.reshape(-1, values.shape[2])
+            sums[index] = np.einsum('nd,nd->d', flat, flat)
         for index, parts in self.contained.items():
-            sums[..., index] -= sums[..., parts].sum(axis=-1)
+            sums[index] -= sums[parts].sum(axis=0)
         # Cancellation may leave a value just below zero.
-        return np.maximum(sums, 0.0)
+        return np.maximum(sums, 0.0).T.reshape(*errors.shape[:-2], -1)
 
     def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
         """Gram matrix of features in each error group, (error groups, width, width).

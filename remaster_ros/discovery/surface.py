@@ -484,15 +484,14 @@ class State:
         of_kind = np.bincount(pool.kind[which], minlength=1)
         alone = of_kind[pool.kind[which]] == 1
         lost = pool.log_prior[which] + np.where(alone, np.log(KIND_ODDS), 0.0)
-        single = pool.sizes[which] == 1
-        first = np.array([where.start for where in self.places], dtype=np.int64)[single]
-        variance, mean = np.diag(self.inverse)[first], self.weights[first]
-        lost[single] += 0.5 * (mean**2 / variance + np.log(variance / levels[single] ** 2))
-        for position in np.flatnonzero(~single).tolist():
-            where = self.places[position]
-            covariance, means = self.inverse[where, where], self.weights[where]
-            determinant = np.linalg.slogdet(covariance / levels[position] ** 2)[1]
-            lost[position] += 0.5 * (means @ np.linalg.solve(covariance, means) + determinant)
+        sizes, first = pool.sizes[which], np.array([where.start for where in self.places])
+        for size in np.unique(sizes).tolist():
+            alike = np.flatnonzero(sizes == size)
+            own = first[alike][:, None] + np.arange(size)
+            covariance, mean = self.inverse[own[:, :, None], own[:, None, :]], self.weights[own]
+            determinant = np.linalg.slogdet(covariance / levels[alike, None, None] ** 2)[1]
+            pulled = np.linalg.solve(covariance, mean[:, :, None])[:, :, 0]
+            lost[alike] += 0.5 * (np.sum(mean * pulled, axis=1) + determinant)
         return lost
 
     def with_block(self, block: int, level: int) -> State:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg.lapack import dpotrf, dtrtrs
 from scipy.special import log_expit, logsumexp
 
 from remaster_ros.calibration.noise import Noise
@@ -153,13 +154,8 @@ class Evaluated:
     factors: Mapping[object, float]  # Precision of the weights of each kind, by key
     families: tuple[Family, ...]  # Kinds of the background
     blocks: tuple[tuple[Candidate, int], ...]  # Candidates that are its blocks, with their levels
-
-    @cached_property
-    def estimate(self) -> tuple[FloatArray, FloatArray]:
-        """Mean and covariance of base coefficients and all weights."""
-        system = System.of(self.data, self.candidates)
-        assert system is not None
-        return system.estimate(self.eta)
+    # Mean and covariance of base coefficients and all weights
+    estimate: tuple[FloatArray, FloatArray]
 
     @cached_property
     def std(self) -> dict[Candidate, float]:
@@ -189,7 +185,12 @@ class Evaluated:
         """
         mean, covariance = self.estimate
         own, spread = mean[where], covariance[np.ix_(where, where)]
-        worth = own @ np.linalg.solve(spread, own) + np.linalg.slogdet(spread)[1]
+        root, wrong = dpotrf(spread, lower=1)
+        if wrong:
+            worth = own @ np.linalg.solve(spread, own) + np.linalg.slogdet(spread)[1]
+        else:
+            worth = np.sum(dtrtrs(root, own, lower=1)[0] ** 2)
+            worth += 2.0 * np.sum(np.log(np.diag(root)))
         return float(0.5 * worth - np.sum(np.log(std)))
 
     def log_factor_of_kind(self, family: Family) -> float:
@@ -258,12 +259,14 @@ def evaluated(
             {} if start is None else start.factors, None if start is None else start.noise
         )
         value = system.marginal(eta) + pool.prior(model) + log_price(families)
+        # Nearly every model is asked for it, and the equations are at hand.
+        estimate = system.estimate(eta)
     except np.linalg.LinAlgError:
         return None
     return Evaluated(
         pool.data, model, float(value), system.candidates, eta, system.noise(eta),
         system.factors(eta), tuple(families),
-        tuple((pool.blocks[block].candidate, level) for block, level in model),
+        tuple((pool.blocks[block].candidate, level) for block, level in model), estimate,
     )  # fmt: skip
 
 
@@ -745,15 +748,13 @@ class Walk:
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
         """All models as solutions in their candidates' parameters, each with its share."""
-        shares = self.share.tolist()
-        return [
-            (self.solution(one), share) for one, share in zip(self.models, shares, strict=True)
-        ]
+        others = [self.solution(one) for one in self.models[1:]]
+        return [*zip([self.best, *others], self.share.tolist(), strict=True)]
 
-    @property
+    @cached_property
     def best(self) -> Solution:
         """The model of the largest share."""
-        return self.solutions[0][0]
+        return self.solution(self.models[0])
 
     def _exchanges(self, best: Evaluated) -> dict[Model, float]:
         """Return log posteriors of models that are nearly as likely with one block exchanged.
@@ -886,9 +887,13 @@ class Walk:
             )
         # A member may be a part of a block: both are parameters of the larger.
         candidates: list[Candidate] = []
+        having: dict[str, list[Candidate]] = {}
         for candidate, *_ in sorted(parts, key=lambda part: -part[0].size):
-            if not any(set(one.parameters).issuperset(candidate.parameters) for one in candidates):
+            larger = having.get(candidate.parameters[0], [])
+            if not any(set(one.parameters).issuperset(candidate.parameters) for one in larger):
                 candidates.append(candidate)
+                for name in candidate.parameters:
+                    having.setdefault(name, []).append(candidate)
         candidates.sort(key=lambda candidate: candidate.penalty is not None)
         names = [name for candidate in candidates for name in candidate.parameters]
         row = {name: p + i for i, name in enumerate(names)}

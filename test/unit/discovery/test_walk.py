@@ -201,3 +201,12 @@ def test_the_p_value_is_a_bound_over_all_kinds():
 
 def test_levels_are_half_decades():
     np.testing.assert_allclose(np.diff(np.log10(LEVELS_M)), 0.5, atol=0.03)
+
+
+def test_the_losses_of_blocks_are_those_of_the_models_without_them():
+    sizes = [np.flatnonzero(pool().sizes == size)[:2].tolist() for size in (1, 2)]
+    model = tuple((block, 3) for block in [*sizes[0], *sizes[1]])
+    state = State.of(surface(), model)
+    for position in range(len(model)):
+        rest = State.of(surface(), model[:position] + model[position + 1 :])
+        assert state.losses[position] == pytest.approx(state.value - rest.value, abs=2e-2)
