@@ -12,6 +12,10 @@ In that time an arm moves by a centimetre, which no tangent follows: the offset 
 Gauss-Newton steps of robust fits with the offset as a parameter, from the offset with which the
 speeds of marker and tool are most alike; the remaining offset is an effect of `discover` and a
 parameter of `fit`.
+
+*Stamps.* A node that stamps frames by their arrival, or by an estimate of the clocks' offset that
+is renewed all the time, adds milliseconds of its own, of which one makes 0.15 mm at 0.15 m/s. A
+camera's frames come at a constant rate: if the frames at such a rate fit better, they are taken.
 """
 
 from __future__ import annotations
@@ -62,6 +66,10 @@ LEAST_ALIKE = 0.5
 # Length of a step below which the offset of the clocks is found, s.
 CLOCK_SETTLED_S = 2e-5
 MOST_CLOCK_STEPS = 12
+# A gap of more periods is counted only with the period that frames on either side of it have.
+LONGEST_COUNTED = 100
+# Of all frames the share whose stamps are within half a period of a constant rate.
+AT_A_RATE = 0.99
 # Longest step, s: beyond it the tangent is not valid.
 LONGEST_CLOCK_STEP_S = 0.05
 # Largest number of rows of a robust fit for the clocks.
@@ -120,6 +128,40 @@ class _Frames:
         return cls(
             stamps, positions, np.array([markers.index(stream.marker) for stream in streams])
         )
+
+    def at_constant_rate(self) -> _Frames | None:
+        """Frames with stamps at a constant rate; None if they do not come at one."""
+        stamps = self.stamps
+        gaps = np.diff(stamps)
+        period = float(np.median(gaps)) if len(gaps) else 0.0
+        if period <= 0.0:
+            return None
+        near = gaps < LONGEST_COUNTED * period
+        for _ in range(2):
+            # Of runs without a long gap, each with a beginning of its own.
+            run = np.concatenate(([0], np.cumsum(~near)))
+            count = np.concatenate(
+                ([0.0], np.cumsum(np.where(near, np.round(gaps / period), 0.0)))
+            )
+            here, times = _less_mean(count, run), _less_mean(stamps, run)
+            square = float(here @ here)
+            if square == 0.0:
+                return None
+            period = float(here @ times) / square
+        whole = np.round((stamps - stamps[0]) / period)
+        line = np.polynomial.Polynomial.fit(whole, stamps, 1)
+        steady = line(whole)
+        within = np.abs(stamps - steady) < 0.5 * period
+        if np.mean(within) < AT_A_RATE or np.any(np.diff(whole) < 1.0):
+            return None
+        return replace(self, stamps=steady)
+
+
+def _less_mean(values: FloatArray, run: IntArray) -> FloatArray:
+    """Values (n,) less the mean of their run, (n,)."""
+    means = np.bincount(run, values) / np.bincount(run)
+    result: FloatArray = values - means[run]
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +240,22 @@ class _Recording:
             std,
             samples,
         )
+
+    def fitted(self, clocks_s: FloatArray, found: bool) -> tuple[FloatArray, _Guess, float]:
+        """Clock offsets, s, robust fit and the median error that it leaves, m.
+
+        ``clocks_s``: offsets to begin with; ``found``: whether they are to be found.
+        """
+        guess: _Guess | None = None
+        error_m = np.inf
+        for _ in range(MOST_CLOCK_STEPS if found else 2):
+            guess, steps_s, error_m = _robust_fit(self.session(clocks_s, guess))
+            if found:
+                clocks_s = clocks_s + np.clip(steps_s, -LONGEST_CLOCK_STEP_S, LONGEST_CLOCK_STEP_S)
+                if np.all(np.abs(steps_s) < CLOCK_SETTLED_S):
+                    break
+        assert guess is not None
+        return clocks_s, guess, error_m
 
     def _seen(self, q: FloatArray, markers: IntArray, sensor: int, guess: _Guess) -> FloatArray:
         """Predicted positions of markers in a sensor's frame, m, (n, m, 3)."""
@@ -359,14 +417,15 @@ def moving_session(
             for own in frames.values()
         ]
     ) + (options.clock_offset_s or 0.0)
-    guess: _Guess | None = None
-    for _ in range(MOST_CLOCK_STEPS if found else 2):
-        session = recording.session(clocks_s, guess)
-        guess, steps_s = _robust_fit(session)
-        if found:
-            clocks_s = clocks_s + np.clip(steps_s, -LONGEST_CLOCK_STEP_S, LONGEST_CLOCK_STEP_S)
-            if np.all(np.abs(steps_s) < CLOCK_SETTLED_S):
-                break
+    clocks_s, guess, error_m = recording.fitted(clocks_s, found)
+    steady = {name: own.at_constant_rate() or own for name, own in frames.items()}
+    restamped: list[str] = []
+    if any(steady[name] is not own for name, own in frames.items()):
+        other = _Recording(where, motion, steady, markers, chain, urdf, options)
+        again = other.fitted(clocks_s, found)
+        if again[2] < error_m:
+            restamped = [_restamped(name, own, steady[name]) for name, own in frames.items()]
+            recording, (clocks_s, guess, _) = other, again
     session = recording.session(clocks_s, guess, rng)
     m = session.measurements
     assert m.velocity is not None
@@ -380,6 +439,7 @@ def moving_session(
             f'by {name}, whose stamps are {_late(-clock)}' + ('' if found else ', as told')
             for i, (name, clock) in enumerate(zip(frames, clocks_s))
         ),
+        *(text for text in restamped if text),
         f'{counted(len(np.unique(m.pose)), "segment")} of about {BLOCK_S * SEGMENT_ROWS:g} s, '
         f'{len(np.unique(m.pose[m.is_validation]))} of them held out; the arm moves at up to '
         f'{np.degrees(np.abs(m.velocity).max()):.0f} degrees/s',
@@ -387,6 +447,18 @@ def moving_session(
     if recording.dropped:
         how.append(f'{recording.dropped} points far from all others of their row were left out')
     return session, how
+
+
+def _restamped(name: str, frames: _Frames, steady: _Frames) -> str:
+    """Sentence on stamps that were replaced; '' if they were not."""
+    if steady is frames:
+        return ''
+    scatter_ms = 1e3 * float(np.std(frames.stamps - steady.stamps))
+    rate_hz = 1.0 / float(np.median(np.diff(steady.stamps)))
+    return (
+        f'the stamps of {name} scatter by {scatter_ms:.2f} ms about a constant rate of '
+        f'{rate_hz:.2f} Hz, with which the robot fits better: they are replaced by it'
+    )
 
 
 def _rate_hz(stream: Stream) -> float:
@@ -490,8 +562,8 @@ def _clock_by_speeds(
     return float(offsets[best]) if alike[best] > LEAST_ALIKE else 0.0
 
 
-def _robust_fit(session: Session) -> tuple[_Guess, FloatArray]:
-    """Robust fit of a session, and the remaining offset of each sensor's clock, s."""
+def _robust_fit(session: Session) -> tuple[_Guess, FloatArray, float]:
+    """Robust fit of a session, the remaining offset of each sensor's clock, s, and the error."""
     problem = Problem.of(session)
     measurements, rows = problem.measurements, problem.fitted
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_FITTED)).astype(np.int64)]
@@ -549,4 +621,4 @@ def _robust_fit(session: Session) -> tuple[_Guess, FloatArray]:
     # Far from the right clock the step of the rest goes too far.
     x = model.natural(moved if np.all(np.abs(solution[len(free) :]) < 5e-3) else z)
     guess = _Guess(model.offsets(x), model.markers(x), inverse(model.T_R_N(x)))
-    return guess, solution[len(free) :]
+    return guess, solution[len(free) :], float(np.median(np.linalg.norm(left, axis=1)))

@@ -85,6 +85,7 @@ def discovery_content(
                 strict=True,
             )
         ],
+        'joint_offsets_alone': estimates(discovery.alone)['joint_offsets'],
         'joint_offsets_after': _with_exact_drawing(discovery, fit['joint_offsets']),
         'sampler': fit['sampler'],
         'registration': fit['registration'],

@@ -314,7 +314,13 @@ class JointCovariance(Struct):
 
 
 class Discovered(Struct):
-    """Content of discovery.json."""
+    """Content of discovery.json.
+
+    A zero-offset has two meanings: beside the causes it is the joint's error where those are zero,
+    for a controller that loads them too (``joint_offsets_after``); without them it is the mean
+    error over the configurations measured, for one that loads offsets alone
+    (``joint_offsets_alone``).
+    """
 
     format: str
     verdict: Literal['effects', 'none', 'undetermined', 'unexplained']
@@ -330,6 +336,7 @@ class Discovered(Struct):
     unexplained: list[Unexplained] | UnsetType = UNSET
     search: SearchRecord | UnsetType = UNSET
     joint_offsets_before: list[OffsetBefore] | UnsetType = UNSET
+    joint_offsets_alone: list[JointOffset] | UnsetType = UNSET
     sampler: SamplerInfo | UnsetType = UNSET
     registration: dict[str, Registration] | UnsetType = UNSET
     markers: dict[str, Marker] | UnsetType = UNSET

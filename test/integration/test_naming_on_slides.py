@@ -83,8 +83,18 @@ def discovered(arm: str, kind: str, seed: int) -> tuple[HiddenWorld, object, Dis
     return hidden, truth, found
 
 
+# What the arithmetic of slides and that of turning joints have apart.
+ALWAYS = {
+    'rail': ('encoder_scale', 'backlash', 'joint_error_curve', 'crooked_guide', 'pitching_guide'),
+    'telescope': ('joint_compliance', 'joint_axis_tilt'),
+}
 CASES = [
-    pytest.param(arm, kind, seed, marks=() if seed == 10 else pytest.mark.qualify)
+    pytest.param(
+        arm,
+        kind,
+        seed,
+        marks=() if seed == 10 and kind in ALWAYS[arm] else pytest.mark.qualify,
+    )
     for arm, kinds in AT_A_SLIDE.items()
     for kind in kinds
     for seed in (10, 11, 12, 13)

@@ -18,6 +18,7 @@ from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing import bags
 from remaster_ros.importing.joint_motion import JointMotion
+from remaster_ros.importing.moving import _Frames
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.session.reader import read_session, write_session
@@ -112,6 +113,41 @@ def test_the_offset_of_the_clocks_is_found(clock_s):
     assert any('early' in line if clock_s > 0 else 'late' in line for line in how)
     told, _ = imported(world, moved, clock_offset_s=clock_s)
     assert told.clock_offset_s['bar'] == clock_s
+
+
+def test_stamps_that_wander_are_replaced_by_the_constant_rate_of_the_frames():
+    """By a millisecond or so, as an estimate of the clocks' offset does that is renewed."""
+    dynamics = replace(without_dynamics(Dynamics(clock_s=0.0)), jitter_s=0.0)
+    world, recording = recorded(3, seconds=12.0, dynamics=dynamics, errors=QUIET)
+    t = recording.frame_stamps
+    wandering = t + 1.5e-3 * np.sin(2.0 * t) + 0.3e-3 * np.sign(np.sin(9.0 * t))
+    session, how = imported(world, replace(recording, frame_stamps=wandering))
+    assert any('scatter by 1.' in line and 'a constant rate of 120.00 Hz' in line for line in how)
+    given, how = imported(world, recording)
+    assert not any('constant rate' in line for line in how)
+    assert session.clock_offset_s['bar'] == pytest.approx(given.clock_offset_s['bar'], abs=2e-4)
+    # Rows of the wandering stamps themselves err by a tenth of a millimetre and more.
+    found = estimate_moving(Problem.of(session))
+    rows = found.posterior.rows
+    errors = rows.target - found.model.predict(found.mode.z, rows)
+    assert np.sqrt(np.mean(errors**2)) < 5e-5
+
+
+def test_frames_of_no_constant_rate_keep_their_stamps():
+    rng = np.random.default_rng(SEED)
+    number = np.concatenate((np.arange(400), np.arange(9_000, 9_400), np.arange(9_411, 9_800)))
+    regular = 5.0 + number / 119.9
+    near = regular + rng.normal(0.0, 5e-4, len(regular))
+
+    def frames(stamps):
+        positions = np.zeros((len(stamps), 1, 3))
+        return _Frames(np.sort(stamps), positions, np.zeros(1, int)).at_constant_rate()
+
+    # Across a gap of a minute, too.
+    np.testing.assert_allclose(frames(near).stamps, regular, atol=1e-4)
+    assert frames(np.cumsum(rng.exponential(1.0 / 120.0, 1000))) is None
+    assert frames(np.cumsum(rng.choice([0.008, 0.013], 1000))) is None
+    assert frames(np.array([1.0])) is None
 
 
 def test_the_bend_of_a_path_moves_no_row():

@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from matplotlib.figure import Figure
 from msgspec import structs
 from worlds.discovery_scenes import at_joint, session_with
@@ -98,6 +99,16 @@ def test_discovery_json_keeps_its_contract(saved):
     assert effect['remedy'].endswith('.')
     assert content['gain']['held_out_rms_after_m'] < content['gain']['held_out_rms_before_m']
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
+    # Alone zero-offsets are those of the files for a controller that loads nothing else.
+    layer = yaml.safe_load((folder / 'apply/offset_layer.yaml').read_text())
+    (parameters,) = (one['ros__parameters'] for one in layer.values())
+    loaded = dict(zip(parameters['joint_names'], parameters['joint_offsets'], strict=True))
+    known = {
+        r['joint']: r['mean_deg'] for r in content['joint_offsets_alone'] if r['identifiable']
+    }
+    assert loaded.keys() == known.keys()
+    for joint, mean_deg in known.items():
+        assert np.degrees(loaded[joint]) == pytest.approx(mean_deg, abs=1e-5)
     assert content['confirmation']['confirmed'] is True
     (confirmed,) = content['confirmation']['effects']
     assert confirmed['answer'] == 'confirmed'
