@@ -26,7 +26,7 @@ from remaster_ros.reports.loadable import geometry_of, uncertainty
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
 from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.json_records import Record, checked, decoded, has_format
+from remaster_ros.session.json_records import Record, checked, decoded, format_of
 from remaster_ros.types import FloatArray, Session
 from remaster_ros.version import __version__
 
@@ -318,5 +318,5 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
 
 def require_own(path: Path, format_: str) -> None:
     """Raise InputError if a file to be replaced is not a JSON file of this format."""
-    if not has_format(read_limited(path, FIT_LIMIT, 'it was there'), format_):
+    if format_of(read_limited(path, FIT_LIMIT, 'it was there')) != format_:
         raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schemas of fit.json and discovery.json: each key once, for writing and reading.
 
+Effects, noise, sampler and the like are the records of `calibration` and `discovery` themselves.
 A key without a default is part of the contract, and a file without it is refused. A key that is
 `UNSET` by default is written if it has a value; other programs' files may lack it. Unknown keys
 are ignored.

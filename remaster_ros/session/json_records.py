@@ -37,28 +37,35 @@ def encoded(content: msgspec.Struct) -> bytes:
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
 
 
+class _AnyFile(msgspec.Struct):
+    """The key that each JSON file of this program has."""
+
+    format: str | None = None
+
+
+def format_of(data: bytes) -> str | None:
+    """Key ``format`` in the bytes of a JSON file; None if it has none.
+
+    What is not looked for is skipped, not built: a hostile file takes no more than its own size.
+    """
+    try:
+        return msgspec.json.decode(data, type=_AnyFile).format
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
+
+
 def decoded(data: bytes, path: Path, record: type[Record], form: str, remedy: str) -> Record:
     """Record in the bytes of a file; unknown keys are dropped.
 
     Raises InputError, a line with `path`, the key and the `remedy`, if it is damaged, lacks a key,
     or has another format than `form`.
     """
-    try:
-        content = msgspec.json.decode(data)
-        # First: another file's keys would only confuse.
-        given = content.get('format', form) if isinstance(content, dict) else form
-        if given == form or not isinstance(given, str):
-            return msgspec.convert(content, record)
-        why = f'format is {given[:60]!r}, not {form!r}'
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        why = ' '.join(str(error).split())
+    # First: another file's keys would only confuse.
+    given = format_of(data)
+    why = f'format is {(given or "")[:60]!r}, not {form!r}'
+    if given in (None, form):
+        try:
+            return msgspec.json.decode(data, type=record)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            why = ' '.join(str(error).split())
     raise InputError(f'{path}: {why}; {remedy}')
-
-
-def has_format(data: bytes, form: str) -> bool:
-    """Whether the bytes of a file are JSON of a format."""
-    try:
-        content = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return False
-    return isinstance(content, dict) and content.get('format') == form
