@@ -152,67 +152,74 @@ def remaster_text(
     )
     steps = [step for group in groups for step in group]
     plain = len(groups) == len(steps) and all(step.is_plain for step in steps)
-    left_out, checks = offsets.left_out, offsets.check_first
-    notes = [f'  {joint}: {why}' for joint, why in left_out.items()]
-    words = [] if offsets.controller is None else pad_in_words(offsets.controller)
-    way: tuple[str, ...] = _PLAIN if plain else _PAD
-    slides = bool(offsets.chain.slides.any())
-    if slides:
-        way = tuple(line.replace('the angle', 'the value') for line in way)
-        way = tuple(line.replace('the same angle', 'the same amount') for line in way)
-    where = 'Left out' if is_single_file else 'Left out of all three'
     urdf_sha256 = hashlib.sha256(offsets.urdf.encode()).hexdigest()
-    return '\n'.join(
+    slides, way = [], _PLAIN if plain else _PAD
+    if offsets.chain.slides.any():
+        slides = [
+            'The true joint position is the reported one plus the offset; of joints that slide',
+            'all is in mm.',
+        ]
+        way = way.replace('the angle', 'the value').replace('the same angle', 'the same amount')
+    ways = [
+        'The true joint angle is the reported one plus the offset. Use ONE of three ways,',
+        'never two at once:',
+        '',
+        *way.splitlines(),
+        f'2. An offset layer between planner and controller: {LAYER_FILE}.',
+        f'3. A corrected robot model for planner and controller: {URDF_FILE}.',
+    ]
+    where, which = 'Left out of all three', ', and ways 2 and 3, are'
+    if is_single_file:
+        ways = [
+            'The true joint angle is the reported one plus the offset. Use no other form of',
+            'this correction beside it.',
+            '',
+            *(line[3:] for line in way.splitlines()),
+        ]
+        where, which = 'Left out', ' are'
+    left_out, pad = [], []
+    if offsets.left_out:
+        but = '' if all(step.determined for step in steps) else ', but for the table above'
+        left_out = [
+            f'{where}, as the data do not determine their offsets. Leave',
+            f'these joints as they are{but}:',
+            *(f'  {joint}: {why}' for joint, why in offsets.left_out.items()),
+        ]
+    if offsets.controller is not None and (words := pad_in_words(offsets.controller)):
+        pad = [
+            'How the angles of the robot description (URDF) come from those on the pad, as',
+            'told when the session was made:',
+            *(f'  {line}' for line in words),
+            f'The offsets above{which} in the numbers of the description.',
+        ]
+    table = _plain_rows(steps) if plain else _pad_rows(groups)
+    paragraphs = (
         [
             f'Joint zero-offsets of robot {offsets.chain.name!r}',
             f'(URDF with SHA-256 {urdf_sha256})',
-            '',
-            *checks,
-            *(('',) if checks else ()),
-            *(('The true joint position is the reported one plus the offset; of joints that slide',
-               'all is in mm.', '') if slides else ()),
-            *(('The true joint angle is the reported one plus the offset. Use no other form of',
-               'this correction beside it.',
-               '',
-               *(line[3:] for line in way)) if is_single_file else
-              ('The true joint angle is the reported one plus the offset. Use ONE of three ways,',
-               'never two at once:',
-               '',
-               *way,
-               f'2. An offset layer between planner and controller: {LAYER_FILE}.',
-               f'3. A corrected robot model for planner and controller: {URDF_FILE}.')),
-            '',
-            *(line for remark in remarks for line in textwrap.wrap(remark, 88)),
-            *(('',) if remarks else ()),
-            *((_plain_rows(steps) if plain else _pad_rows(groups)) if steps else
-              ('  No joint: these data determine no offset.',)),
-            *(('', f'{where}, as the data do not determine their offsets. Leave',
-               'these joints as they are'
-               f'{"" if all(step.determined for step in steps) else ", but for the table above"}:',
-               *notes) if notes else ()),
-            *(('', 'How the angles of the robot description (URDF) come from those on the pad, as',
-               'told when the session was made:', *(f'  {line}' for line in words),
-               'The offsets above'
-               f'{" are" if is_single_file else ", and ways 2 and 3, are"} in the numbers of the '
-               'description.')
-              if words else ()),
-            '',
+        ],
+        offsets.check_first,
+        slides,
+        ways,
+        [line for remark in remarks for line in textwrap.wrap(remark, 88)],
+        table if steps else ['  No joint: these data determine no offset.'],
+        left_out,
+        pad,
+        [
             'Afterwards measure ten new poses and run "remaster verify": it shows whether the',
             'offsets act, and that they do not act twice.',
-            '',
-        ]
-    )  # fmt: skip
+        ],
+    )
+    return '\n\n'.join('\n'.join(lines) for lines in paragraphs if lines) + '\n'
 
 
-_PLAIN = (
-    '1. Re-master on the pad: drive each joint to the angle in the last column, as the',
-    "   robot reports it now, and set that place as the joint's new zero.",
-)
-_PAD = (
-    '1. Re-master on the pad, in the numbers of the pad, line by line: drive the joint until',
-    '   the pad shows the angle under "drive to", and set it, in that place, so that the pad',
-    '   shows the angle under "set to". Any other place does as well: add the same angle to both.',
-)
+_PLAIN = """\
+1. Re-master on the pad: drive each joint to the angle in the last column, as the
+   robot reports it now, and set that place as the joint's new zero."""
+_PAD = """\
+1. Re-master on the pad, in the numbers of the pad, line by line: drive the joint until
+   the pad shows the angle under "drive to", and set it, in that place, so that the pad
+   shows the angle under "set to". Any other place does as well: add the same angle to both."""
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
