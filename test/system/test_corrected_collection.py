@@ -42,6 +42,7 @@ def true_correction(folder, share=1.0):
     return save(folder, model, cell.urdf_text), truth.joint_offsets
 
 
+@pytest.mark.qualify
 def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
     """Of all joints together one is outside in a session of 500: seeds are fixed, moments not.
 
