@@ -18,7 +18,7 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
-from remaster_ros.discovery.walk import NEEDED, Walk, at_any_time, identity, p_value
+from remaster_ros.discovery.walk import NEEDED, Identity, Walk, at_any_time, identity, p_value
 from remaster_ros.discovery.words import (
     KIND_OF_SUBJECT,
     clock_time,
@@ -349,13 +349,22 @@ def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
     return bool(cosines.min() > SAME)
 
 
+OTHER_FORM = 'a part or another form of a cause that is named'
+NOT_IN_BEST = 'other models have it, the likeliest one has not'
+"""Why a cause of a probability above one half is not named."""
+
+
 class LessLikely(Struct, frozen=True):
-    """A cause that is rather not there than there."""
+    """A cause that some models have and that is not named.
+
+    Its probability is below one half unless ``why`` has the reason.
+    """
 
     name: str
     joints: tuple[int, ...]
     title: str  # A heading for people
     probability: float
+    why: str = ''
 
 
 class SearchRecord(Struct, frozen=True):
@@ -379,12 +388,20 @@ class SearchRecord(Struct, frozen=True):
             for model in walk.models
             for candidate in walk.present(model)
         }
+        best = {identity(candidate) for candidate in walk.named(walk.models[0])}
+
+        def why(key: Identity) -> str:
+            if walk.probability[key] < 0.5:
+                return ''
+            return OTHER_FORM if key in best else NOT_IN_BEST
+
         less = [
             LessLikely(
                 EFFECTS[candidate.name].reported_as or candidate.name,
                 candidate.joints,
                 titled(candidate, candidate.joints),
                 walk.probability[key],
+                why(key),
             )
             for key, candidate in candidates.items()
             if at_any_time(candidate) not in taken

@@ -37,6 +37,8 @@ def found_in(recipe):
     print(recipe.seed, *map(str, hidden.truth.effects), '->', found.verdict)
     for effect in found.effects:
         print('   ', effect.title, effect.probability)
+    # What is likelier there than not is named, or it is said why not.
+    assert all(one.probability < 0.5 or one.why for one in found.search.less_likely)
     return hidden, found
 
 
