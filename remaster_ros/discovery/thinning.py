@@ -2,8 +2,8 @@
 
 The search holds thousands of columns of every row it is given, 0.1 MB each. An effect stands out
 of the noise with the root of their number, so beyond `MOST_ROWS` rows little is gained: an effect
-that 100,000 rows just show is a sixth of the size of one that 3,000 just show, a few hundredths of
-the noise of one reading. So the search is given a part of them, drawn evenly over time and
+that 100,000 rows just show is a seventh of the size of one that 2,000 just show, a few hundredths
+of the noise of one reading. So the search is given a part of them, drawn evenly over time and
 sensors. Everything else works on all rows: the offsets before, the sampled model with the causes,
 the gain. The rows that were not searched test the causes with their parameters frozen.
 """
@@ -18,7 +18,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
-MOST_ROWS = 3_000
+MOST_ROWS = 2_000
 """Sessions of fewer are searched whole."""
 FEWEST_TO_SEARCH = 12
 """Poses from which on a search for causes is worth its while."""
