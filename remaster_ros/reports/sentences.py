@@ -291,8 +291,8 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
         return 'But what is left is no noise of any instrument: the model does not hold.'
     if not any(check.noise_std_m is not None for check in unexplained):
         return (
-            'But what is left has structure, which noise has not: other errors dominate; '
-            f'{SEARCH}.'
+            'But what is left has structure, which noise has not: there are other errors beside '
+            f'it; {SEARCH}.'
         )
     return f'But noise does not explain what is left: other errors dominate; {SEARCH}.'
 
