@@ -207,6 +207,7 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
         while new in taken:
             new += f'_{number}'
         names[name] = new
+        taken.add(new)
     return names
 
 

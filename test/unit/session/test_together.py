@@ -57,6 +57,20 @@ def test_the_arm_is_shared_and_registrations_are_not(made, halves) -> None:
     assert np.all(stds[2] < np.minimum(stds[0], stds[1]))
 
 
+def test_markers_whose_names_are_numbered_already_keep_apart(halves) -> None:
+    """As those of the demo: the first of the second session is not the second of the first."""
+    numbered = []
+    for half in halves:
+        places = {'ball': np.zeros(3), 'ball_2': np.ones(3), 'ball_3': 2.0 * np.ones(3)}
+        rows = replace(half.measurements, marker=half.measurements.observation % 3)
+        sensors = dict(zip(half.sensors, places, strict=False))
+        numbered.append(replace(half, markers=places, sensors=sensors, measurements=rows))
+    whole, _ = together([('monday', numbered[0]), ('tuesday', numbered[1])])
+    assert len(whole.markers) == 6
+    place = np.array([whole.markers[whole.marker_names[i]] for i in whole.measurements.marker])
+    np.testing.assert_array_equal(place[:, 0], whole.measurements.marker % 3)
+
+
 @pytest.fixture(scope='module')
 def of_another_arm(made):
     """A session of an arm of the same kind, with zero-offsets of its own."""
