@@ -25,7 +25,11 @@ NODES = {
 
 
 def main(argv: list[str]) -> int:
-    """Run the node that the first argument names; list the nodes if there is none."""
+    """Run the node that the first argument names; list the nodes without one, or for -h or --list.
+
+    Returns the exit status: 0 after a list, 2 with a line on stderr for an unknown name, else the
+    node's. ``argv``: arguments without the program's name.
+    """
     if not argv or argv[0] in ('-h', '--help', '--list'):
         print('usage: python -m remaster_ros.nodes NAME --ros-args …\n')
         for name, text in NODES.items():

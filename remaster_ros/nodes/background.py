@@ -43,12 +43,16 @@ class Background:
         self._work.put((work, then))
 
     def close(self, timeout_s: float = 5.0) -> None:
-        """End the thread after the queued jobs; wait for its end `timeout_s` at most."""
+        """End the thread after the jobs queued so far; wait for its end `timeout_s` at most.
+
+        Jobs queued later never run. The thread is a daemon: what takes longer ends with the
+        process.
+        """
         self._work.put(None)
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        """Thread: run queued jobs in order, keeping result or exception; end at a None."""
+        """Thread: run queued jobs in order, keep each result or exception; end at a None."""
         while (item := self._work.get()) is not None:
             work, then = item
             try:
@@ -79,10 +83,12 @@ class PlanningThread:
         self._result: tuple[Any] | None = None
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
-        """Return a job's result in a tuple, or raise its exception; None while the job runs.
+        """Return a job's result in a tuple, or raise its exception; None while a job runs.
 
-        ``what``: identifier of the job; ``q``: configuration of the arm, rad or m, (k,). A result
-        of another job, or for an arm that has moved by more than `MOVED_RAD` since, is dropped.
+        To be called again and again: the first call starts `job` in the background, a later one
+        with the same arguments fetches its result, once. ``what``: identifier of the job; ``q``:
+        configuration of the arm, rad or m, (k,). A result of another job, or for an arm that has
+        moved by more than `MOVED_RAD` since, is dropped, and `job` is started anew.
         """
         if self._is_working:
             return None
@@ -100,5 +106,5 @@ class PlanningThread:
         return result
 
     def _store(self, result: Any) -> None:
-        """Store the result of a job."""
+        """Keep a job's result (or exception) for `ask`, which may start another job then."""
         self._result, self._is_working = (result,), False

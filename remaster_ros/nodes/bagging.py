@@ -55,7 +55,11 @@ class BagRecorder:
             self.reopen()
 
     def reopen(self) -> None:
-        """Resume the bag after it was closed; begin another one if it is damaged."""
+        """Resume the bag after it was closed, or begin it; nothing if `began` is None.
+
+        If the bag is damaged, another one (``bag_1``, …) is begun, with a line in `notes`. The
+        first record is written again, marked as continued. Raises InputError if that fails too.
+        """
         if self._began is None:
             return
         try:
@@ -74,7 +78,10 @@ class BagRecorder:
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
         """Write a message with the node's time; earlier ones wait until the node has a time.
 
-        A bag that began at time 0 would be as long as the time of the simulation.
+        A bag that began at time 0 would be as long as the time of the simulation. Nothing is
+        written while the bag is closed. `dropped` counts what finds no room: on the disk (no
+        DiskError is raised), or beyond `MOST_EARLY` waiting messages. ``data``: the serialised
+        message.
         """
         if self._writer is None:
             return
@@ -103,10 +110,10 @@ class BagRecorder:
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
 
-        ``with_info``: call it with rclpy's info of the message as well.
-
-        In the bag the topic is named by `name_in_bag`, without namespace and remapping, so that a
-        bag can be replayed in any namespace.
+        ``kind``: the message's class; ``with_info``: call it with rclpy's info of the message as
+        well. In the bag the topic is named by `name_in_bag`, without namespace and remapping, so
+        that a bag can be replayed in any namespace. A message that cannot be decoded is not
+        recorded: the callback raises InputError, which `RemasterNode` logs.
         """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'
@@ -149,7 +156,10 @@ class BagRecorder:
         )
 
     def subscribe_rest(self) -> None:
-        """Record the topics that the recorder does not use itself."""
+        """Record the topics that the recorder does not use itself; nothing if it records no bag.
+
+        They are the target pose, status, registrations, and joint offsets with their deviations.
+        """
         if self._began is None:
             return
         self.subscribe(PoseStamped, 'remaster/target_pose')

@@ -65,7 +65,10 @@ class CellSensors:
             bag.subscribe(Temperature, topic, recorder.take_temperature)
 
     def _taker(self, recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], None]:
-        """Return the callback for readings of a marker."""
+        """Return the callback for readings of a marker: each goes to `recorder`.
+
+        One that the recorder accepts shows that the sensor is alive.
+        """
 
         def take(message: PointStamped | PoseStamped) -> None:
             if recorder.take_marker(sensor, marker, message):
@@ -74,7 +77,7 @@ class CellSensors:
         return take
 
     def take(self, record: EventRecord, report: SensorReport) -> None:
-        """Update the liveness of a sensor by its node's report."""
+        """Update the liveness of a sensor by its node's report, carried by `record`."""
         self._liveness.node_reports(
             report.sensor,
             report.ready,
@@ -85,7 +88,7 @@ class CellSensors:
         )
 
     def missing(self) -> str:
-        """Return the required sensors that are absent, and why, as text; ''."""
+        """Return the required sensors that are absent, and why, as text; '' if none is."""
         return self.required.missing(self._absent())
 
     def read_age_s(self) -> dict[str, float | None]:
@@ -102,9 +105,13 @@ class CellSensors:
         self._shots.look(pairing, self._absent(), self._steady_s())
 
     def give_up(self, recording: Recording) -> None:
-        """Reject readings that are overdue."""
+        """Reject what the sensors still owe the pairing under way, if it is overdue.
+
+        See `Pairing.give_up`: absent sensors that are required are waited for. Nothing without a
+        pairing.
+        """
         recording.give_up(self._absent(), self._liveness.reports)
 
     def _absent(self) -> dict[str, str]:
-        """Return the absent sensors, and why."""
+        """Return the sensors that are absent now, name -> reason; {} if there are none."""
         return self._liveness.absent(self._steady_s(), self.required.names)

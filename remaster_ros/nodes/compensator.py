@@ -216,13 +216,20 @@ class CompensatorNode(RemasterNode):
         self.create_timer(WATCH_S, self._look, clock=self._steady)
 
     def _read(self) -> Any:
-        """Read the correction in use from the file of the parameter `compensation`."""
+        """Read the correction in use from the file of the parameter `compensation`.
+
+        Raises InputError: no such file, a joint slides, or a change above `max_change_deg`.
+        """
         from remaster_ros.compensation.in_use import CorrectionInUse
 
         return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)
 
     def on_fault(self, error: Exception) -> None:
-        """Halt after a fault of this program: cancel goals, pass nothing on until ~/enable."""
+        """Halt after a fault of this program: cancel goals, pass nothing on until ~/enable.
+
+        An arm that moves is braked by a trajectory of the gate, on the controller's topic. The
+        fault is logged as in `RemasterNode.on_fault`.
+        """
         super().on_fault(error)
         if not hasattr(self, '_steady'):
             # It is being made: nothing has been passed on.
@@ -244,11 +251,15 @@ class CompensatorNode(RemasterNode):
     # Whether it may pass anything on
 
     def _on_description(self, message: String) -> None:
+        """Keep the published robot description, and how it contradicts the correction."""
         self._description = message.data
         self._described = self._described_trouble()
 
     def _described_trouble(self) -> str:
-        """Return how the robot description contradicts the correction, or ''."""
+        """Return how the robot description contradicts the correction; '' if it does not.
+
+        Also if nobody has published one, or if it holds the correction already (`NEARER`).
+        """
         topic = self.resolve_topic_name(DESCRIPTION)
         if self._description is None:
             return (
@@ -269,7 +280,12 @@ class CompensatorNode(RemasterNode):
         )
 
     def _trouble(self) -> str:
-        """Return why no trajectory is passed on, or ''."""
+        """Return why no trajectory is passed on, or ''.
+
+        In this order: a halt; a chained compensator; no fresh joint states
+        (`ArmReports.is_fresh`); a temperature older than `WARM_S`; then description, other
+        publishers of joints or commands, and an arm that is elsewhere (`_misled`).
+        """
         topic = self.resolve_topic_name(JOINTS)
         if self._halted:
             return self._halted
@@ -296,9 +312,11 @@ class CompensatorNode(RemasterNode):
         )
 
     def _misled(self) -> str:
-        """Return in words that the arm is not on the path it was sent along, or at its end.
+        """Return in words that the arm is not where it was led, on its path or at the end; ''.
 
-        '' if it is.
+        Up to `STOPPED_S` after the trajectory's end the reported joints have to be within
+        `ON_PATH_RAD` of a place of it that the arm may lag at; later, or with no trajectory passed
+        on, `LedLast` decides.
         """
         q, since_s = self._present.q, self.now_s() - self._begun_s
         passed = self._passed
@@ -310,7 +328,7 @@ class CompensatorNode(RemasterNode):
         return self._led.elsewhere(q)
 
     def _moves(self) -> str:
-        """Return that the arm moves, is about to, or is not reported; or ''."""
+        """Return that the arm moves, is about to, or is not reported; '' if it stands."""
         if not self._present.is_fresh(time.monotonic()):
             return f'{self.resolve_topic_name(JOINTS)} does not come'
         if not self._present.stands:
@@ -319,7 +337,10 @@ class CompensatorNode(RemasterNode):
         return f'a trajectory is under way for {left_s:.1f} s more' if left_s > 0.0 else ''
 
     def _look(self) -> None:
-        """Switch on once the arm stands without trouble; end goals whose controller has gone."""
+        """Switch on once the arm stands without trouble; end goals whose controller has gone.
+
+        Timer callback, every `WATCH_S`. It switches on by itself only before the first switch.
+        """
         trouble = self._trouble()
         if self._on is None and not (trouble or self._moves()):
             self._turn(True)
@@ -330,7 +351,13 @@ class CompensatorNode(RemasterNode):
                 self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
 
     def _switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Serve a request to switch the correction on (read anew) or off; refused while moving."""
+        """Serve a request to switch the correction on (read anew) or off.
+
+        Refused, with the reason in the response, while the arm moves or is not reported; on also
+        if it is elsewhere and not confirmed (`LedLast.confirm`), or the file is invalid, of other
+        joints, or contradicts the description. Switching on ends a halt; if it is refused, the
+        correction before remains.
+        """
         why = self._moves()
         if on and not why and self._led.elsewhere(self._present.q):
             why = self._led.confirm(self._present.q)
@@ -357,7 +384,10 @@ class CompensatorNode(RemasterNode):
         return response
 
     def _turn(self, on: bool) -> str:
-        """Switch the correction on or off; return a sentence on the correction in use."""
+        """Switch the correction on or off; log and return a sentence on the one in use.
+
+        Makes a new motion gate and new true angles, and outdates a trajectory that is worked out.
+        """
         self._on, self._wanted = on, -1
         self._true = self._motion.TrueAngles(self._correction.compensator)
         self._in_use = used = self._correction if on else self._correction.off()
@@ -373,7 +403,11 @@ class CompensatorNode(RemasterNode):
         return text
 
     def _tell(self, trouble: str) -> None:
-        """Publish the state of the correction if it has changed, and log a trouble."""
+        """Publish ~/state (JSON, latched) if it has changed; log why nothing is passed on, if so.
+
+        ``trouble``: of `_trouble`. The state has ``correction`` (on or off), ``sha256`` and
+        ``why``.
+        """
         state = {
             'correction': 'on' if self._on else 'off',
             'sha256': self._correction.sha256,
@@ -396,18 +430,21 @@ class CompensatorNode(RemasterNode):
     # Where the arm is
 
     def _on_temperature(self, message: Temperature) -> None:
+        """Keep a temperature, °C, and when it came; ignore one that is not finite."""
         if np.isfinite(message.temperature):
             self._temperature_c, self._warm_wall_s = message.temperature, time.monotonic()
 
     @property
     def _warm(self) -> float | None:
-        """Temperature to correct with, °C; None if the correction does not need it."""
+        """Temperature to correct with, °C; None if none is needed, or none has come."""
         return self._temperature_c if self._correction.compensator.model.grows else None
 
     def _on_joint_state(self, message: JointState, info: Any) -> None:
-        """Publish the true joint angles, or the reported ones with the correction off.
+        """Publish joint states with the true angles; as reported with the correction off.
 
-        Positions that are not finite are refused; those of other joints are passed on unchanged.
+        Of the arm nothing is published before the first switch, nor if a position is not finite or
+        beyond `FARTHEST_RAD`, which is logged. Messages that name no joint of the arm are passed
+        on unchanged.
         """
         if not self._order.concerns(message):
             # A gripper's: the planner wants to know of it too.
@@ -445,9 +482,11 @@ class CompensatorNode(RemasterNode):
     ) -> None:
         """Correct a planner's trajectory in the background, and pass on the result or refuse it.
 
-        Beside the callbacks, as that takes a second where there are ten thousand points. A
-        trajectory that comes meanwhile takes its place; an empty one, which lets the controller
-        hold the arm, waits for nothing.
+        ``pass_on``: called with the corrected message; ``refuse``: called with the reason, at once
+        if `_trouble` or its stamp (other than 0, and more than `NOW_S` from now) forbids it. In
+        the background, since it takes a second for ten thousand points. A trajectory that comes
+        meanwhile takes its place; an empty one, which lets the controller hold the arm, is done at
+        once.
         """
         number = self._wanted = next(self._numbers)
         try:
@@ -505,7 +544,12 @@ class CompensatorNode(RemasterNode):
         warm: float | None,
         told: FloatArray | None,
     ) -> tuple[Any, JointTrajectory]:
-        """Return the corrected trajectory and its message; uses no state that callbacks change."""
+        """Return the corrected trajectory (`SentTrajectory`) and its message.
+
+        ``warm``: temperature, °C, or None; ``told``: the arm's angles as the planner was told,
+        rad, (k,), None with the correction off. Uses no state that callbacks change. Raises
+        InputError if the trajectory is refused.
+        """
         wanted = self._motion.Trajectory(*_points(message, self._names))
         passed = self._motion.corrected_for_controller(
             wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, told
@@ -513,9 +557,11 @@ class CompensatorNode(RemasterNode):
         return passed, self._message(passed.admitted)
 
     def _outdated(self, number: int, arm: Any, found: Any) -> str:
-        """Return why a corrected trajectory is not passed on after all (outdated, trouble).
+        """Return why a corrected trajectory is not passed on after all; '' if it is.
 
-        '' if it is passed on. ``number``: of the trajectory; ``arm``: state it was corrected for.
+        ``number``: of the trajectory; ``arm``: reports it was corrected for; ``found``: result or
+        exception. Reasons: a newer trajectory, a trouble since, an arm that stood and has moved by
+        more than `START_RAD`, one on its way for which the gate refuses it now.
         """
         if number != self._wanted:
             return 'another trajectory has come since'
@@ -539,7 +585,10 @@ class CompensatorNode(RemasterNode):
         return ''
 
     def _note_led(self, passed: Any) -> None:
-        """Keep the trajectory that was passed on, its times, and where it leads the arm."""
+        """Keep the trajectory that was passed on, its times, and where it leads the arm.
+
+        An empty one leads nowhere: the controller holds the arm (`_note_held`).
+        """
         self._true.lead(passed)
         if not passed.admitted.waypoints:
             self._note_held()
@@ -549,7 +598,11 @@ class CompensatorNode(RemasterNode):
         self._keep(passed.admitted.waypoints[-1].q)
 
     def _note_held(self) -> None:
-        """Note that the controller holds the arm somewhere along the trajectory passed on."""
+        """Note that the controller holds the arm somewhere along the trajectory passed on.
+
+        The places it may be at are those within the allowed lag of now; no trajectory is under way
+        then.
+        """
         passed, since_s = self._passed, self.now_s() - self._begun_s
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s:
             lag_s = allowed_lag_s(SupervisorRules(), 1.0)
@@ -557,18 +610,26 @@ class CompensatorNode(RemasterNode):
         self._passed, self._end_s = None, self.now_s()
 
     def _keep(self, *samples: FloatArray) -> None:
-        """Note where the arm is led to; write the last position to the command file, if kept."""
+        """Note where the arm is led to; write the last sample to the command file.
+
+        ``samples``: configurations on the way, rad, (k,) each. The file is written in the
+        background; not in a simulation.
+        """
         self._led.lead_to(*samples)
         if self._keeps_end:
             write = partial(self._command_file.write, samples[-1], time.time_ns())
             self._disk.submit(write, self._on_written)
 
     def _on_written(self, result: object) -> None:
+        """Log an error if `result` is the exception of writing the command file."""
         if isinstance(result, Exception):
             self._say(f'{self._command_file.path}: where the arm was led is not kept ({result})')
 
     def _message(self, admitted: Admitted) -> JointTrajectory:
-        """Return an admitted trajectory as a message; nothing else is ever sent."""
+        """Return an admitted trajectory as a message; nothing else is ever sent.
+
+        Its stamp is 0, for at once; points have no velocities if the trajectory is straight.
+        """
         message = JointTrajectory(joint_names=list(self._names))
         message.points = [
             JointTrajectoryPoint(
@@ -581,7 +642,10 @@ class CompensatorNode(RemasterNode):
         return message
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        """Correct a trajectory and publish it to the controller; refused without a subscriber."""
+        """Correct a trajectory and publish it to the controller; refused without a subscriber.
+
+        A refusal is logged.
+        """
 
         def refuse(why: str) -> None:
             self._say(f'trajectory refused: {why}')
@@ -594,7 +658,10 @@ class CompensatorNode(RemasterNode):
     # The same by the action
 
     def _offer_action(self, controllers: str) -> None:
-        """Offer follow_joint_trajectory, as a client of the action named `controllers`."""
+        """Offer ~/follow_joint_trajectory, as a client of the action named `controllers`.
+
+        Raises InputError if control_msgs is not installed.
+        """
         self._action, _ = control_messages()
         self._controllers = self.resolve_topic_name(controllers)
         self._client = ActionClient(self, self._action, self._controllers)
@@ -609,7 +676,12 @@ class CompensatorNode(RemasterNode):
         )
 
     def _on_goal(self, handle: Any) -> None:
-        """Correct the trajectory of a goal and send it to the controller, or refuse the goal."""
+        """Correct the trajectory of a goal and send it to the controller, or refuse the goal.
+
+        Refused, with a line in the log: a multi_dof_trajectory, no such action of the controller,
+        and all that `_submit` refuses. The goal ends as cancelled then if the client cancelled it,
+        else aborted.
+        """
         goal = _Goal(handle)
         request = handle.request
 
@@ -634,10 +706,15 @@ class CompensatorNode(RemasterNode):
             self._submit(request.trajectory, pass_on, refuse)
 
     def _refused(self, why: str) -> Any:
+        """Return a result of the action with INVALID_GOAL and the reason."""
         return self._action.Result(error_code=self._action.Result.INVALID_GOAL, error_string=why)
 
     def _on_answer(self, goal: _Goal, future: Future) -> None:
-        """Process whether the controller accepts a goal; a refused goal is aborted."""
+        """Process whether the controller accepts a goal; abort a goal that it refuses.
+
+        The newest goal has led the arm nowhere then. One that was cancelled meanwhile is cancelled
+        at the controller. Nothing without a result.
+        """
         if future.cancelled() or future.result() is None:
             return
         if not future.result().accepted:
@@ -655,7 +732,11 @@ class CompensatorNode(RemasterNode):
             goal.sent.cancel_goal_async()
 
     def _on_feedback(self, goal: _Goal, message: Any) -> None:
-        """Pass on feedback of the controller, with true joint angles if correction is on."""
+        """Pass on feedback of the controller, with true joint angles if the correction is on.
+
+        Nothing for a goal that is over. The angles are desired and actual positions, changed in
+        place.
+        """
         feedback = message.feedback
         if goal.over or not goal.handle.is_active:
             return
@@ -670,7 +751,10 @@ class CompensatorNode(RemasterNode):
         goal.handle.publish_feedback(feedback)
 
     def _on_cancel(self, handle: Any) -> CancelResponse:
-        """Cancel a goal at the controller, or while it is worked out; REJECT an unknown goal."""
+        """Cancel a goal at the controller, or while it is worked out; REJECT an unknown goal.
+
+        Returns ACCEPT also if the goal is over at the controller by then.
+        """
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
                 goal.cancelled = True
@@ -683,7 +767,11 @@ class CompensatorNode(RemasterNode):
         return CancelResponse.REJECT
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
-        """End a goal as the controller has ended it; note where the arm is held if it failed."""
+        """End a goal as the controller has ended it, with its result; nothing without a result.
+
+        If it was the newest, no trajectory is under way; where the arm is held is noted if it
+        failed.
+        """
         if not future.cancelled() and future.result() is not None:
             if goal is self._goals[-1]:
                 succeeded = future.result().status == GoalStatus.STATUS_SUCCEEDED
@@ -693,7 +781,11 @@ class CompensatorNode(RemasterNode):
             self._end(goal, future.result().status, future.result().result)
 
     def _end(self, goal: _Goal, status: int, result: Any) -> None:
-        """Tell the client how its goal has ended."""
+        """Tell the client how its goal has ended, and forget the goal; again does nothing.
+
+        ``status``: of `GoalStatus`; one that is neither succeeded nor cancelled by this client is
+        told as aborted.
+        """
         if goal.over:
             return
         goal.over = True
@@ -713,7 +805,10 @@ class CompensatorNode(RemasterNode):
         goal.handle.execute(ended)
 
     def close(self) -> None:
-        """Let the controller hold an arm whose goal nobody can cancel any more."""
+        """Cancel the goals under way, so that the controller holds the arm, and end the threads.
+
+        Waits at most `LAST_ANSWER_WALL_S` for the controller's answers.
+        """
         self._work.close(0.5)
         self._disk.close()
         awaited = [goal.sent.cancel_goal_async() for goal in self._goals if goal.sent is not None]
@@ -727,9 +822,11 @@ class CompensatorNode(RemasterNode):
 def _points(
     message: JointTrajectory, names: tuple[str, ...]
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Return times (n,), positions and velocities (n, k), joints in the order of `names`.
+    """Return times (n,), s, positions and velocities (n, k), joints in the order of `names`.
 
-    Raises InputError: other joints than the arm's, or points that are not whole.
+    Velocities are None if no point has any, or there are no points (n = 0). Raises InputError:
+    other joints than the arm's, a joint named twice, points that are not whole, or velocities of
+    some points only.
     """
     given = tuple(message.joint_names)
     none = np.zeros((0, len(names)))

@@ -66,7 +66,10 @@ and its answer take on one computer, and no one who ends it notices."""
 
 
 def action_of(topic: str) -> str:
-    """Return the action of the controller that has this topic of commands."""
+    """Return the action of the controller that has this topic of commands.
+
+    The last part of `topic` is replaced: ``a/joint_trajectory`` -> ``a/follow_joint_trajectory``.
+    """
     return f'{topic.rpartition("/")[0]}/follow_joint_trajectory'
 
 
@@ -96,14 +99,17 @@ class ForeignGoals:
     def begin(self) -> None:
         """Count only goals that come from now on.
 
-        joint_trajectory_controller may list one that was replaced as under way until the next one
-        comes, so that what a former bridge has left says nothing. Where the arm really moves by
+        joint_trajectory_controller may list a goal that was replaced as under way until the next
+        one comes, so that what a former bridge has left says nothing. If the arm really moves by
         it, nothing is commanded before it stands.
         """
         self._earlier = set(self._active)
 
     def trouble(self) -> str:
-        """Return a sentence that another client has a goal under way, or ''."""
+        """Return a sentence that another client has a goal under way; '' if none has.
+
+        Goals in `own`, and those that were under way at the last `begin`, do not count.
+        """
         if self._active <= self.own | self._earlier:
             return ''
         return f'another client has sent a goal to {self._action}: end that client'
@@ -131,7 +137,7 @@ class ControllerStates:
 
 
 def _expiring(profile: QoSProfile) -> QoSProfile:
-    """Return a profile whose messages are given up after `EXPIRES_S`."""
+    """Return a profile whose messages are given up after `EXPIRES_S`, and else as `profile`."""
     return QoSProfile(
         depth=profile.depth,
         reliability=profile.reliability,
@@ -159,7 +165,7 @@ class TopicLink:
         return bool(self._publisher.get_subscription_count())
 
     def listens(self) -> bool:
-        """Whether a node other than ours subscribes to the commands."""
+        """Whether a node that is no recorder, bridge or sensor node subscribes to the commands."""
         if not self.matched():
             return False
         found = self._node.get_subscriptions_info_by_topic(self._topic)
@@ -167,11 +173,14 @@ class TopicLink:
         return any(name not in LISTENERS and not kind_of(name) for name in names)
 
     def rival(self) -> str:
-        """Return who else commands the controller, ''; publishers are counted elsewhere."""
+        """Return '': who else publishes commands is counted elsewhere (`nodes.rivals`)."""
         return ''
 
     def send(self, message: JointTrajectory, kind: str) -> None:
-        """Send a trajectory that the motion gate has admitted: a move, a renewal or a stop."""
+        """Publish a trajectory that the motion gate has admitted, at once.
+
+        ``kind``: move, renewal or stop, which makes no difference here.
+        """
         self._publisher.publish(message)
 
     def cancel(self) -> None:
@@ -225,7 +234,7 @@ class ActionLink:
     listens = matched
 
     def rival(self) -> str:
-        """Return a sentence on another node that is a client of the action, or ''."""
+        """Return a sentence on the other nodes that are clients of the action; '' for none."""
         service = f'{self._action}/_action/send_goal'
         if self._node.count_clients(service) <= 1:
             return ''
@@ -250,7 +259,11 @@ class ActionLink:
         )
 
     def send(self, message: JointTrajectory, kind: str) -> None:
-        """Send a trajectory that the motion gate has admitted, in place of the one under way."""
+        """Send a trajectory that the motion gate has admitted, in place of the one under way.
+
+        ``kind``: ``move`` (forgets earlier goals), ``renewal`` or ``stop``, whose tolerances
+        differ. Returns at once; a refusal comes by `failed`. A copy is published on `COPIES`.
+        """
         names, rules = message.joint_names, self._rules
         # rad or m, as the positions.
         end = np.full(len(names), rules.settle.arrive_tolerance) * rules.units.per_radian
@@ -289,7 +302,10 @@ class ActionLink:
             goal.cancelled = True
 
     def close(self) -> None:
-        """Wait for the answers: a stop that is refused is followed by a cancelling."""
+        """Wait for the answers, at most `LAST_ANSWER_WALL_S`.
+
+        A stop that is refused is followed by a cancelling.
+        """
         executor, end = self._node.executor, time.monotonic() + LAST_ANSWER_WALL_S
         while executor is not None and self._awaited and self._node.context.ok():
             if time.monotonic() > end:
@@ -297,21 +313,27 @@ class ActionLink:
             executor.spin_once(timeout_sec=0.01)
 
     def _tolerances(self, names: Sequence[str], values: FloatArray) -> list[Any]:
+        """Return tolerance messages of the joints, of position alone; ``values``: rad or m."""
         pairs = zip(names, values, strict=True)
         return [self._tolerance_type(name=name, position=float(value)) for name, value in pairs]
 
     def _await(self, future: Future, done: Callable[[_Goal, Any], None], goal: _Goal) -> None:
+        """Call `done` with the goal and the answer when it comes; `close` waits for it."""
         self._awaited.append(future)
         future.add_done_callback(partial(self._take, done, goal))
 
     def _take(self, done: Callable[[_Goal, Any], None], goal: _Goal, future: Future) -> None:
-        """Process the answer to a request of a goal, unless it was cancelled or is empty."""
+        """Process the answer to a request of a goal; nothing if it was cancelled or is None."""
         self._awaited.remove(future)
         if not future.cancelled() and future.result() is not None:
             done(goal, future.result())
 
     def _on_answer(self, goal: _Goal, handle: Any) -> None:
-        """Process whether the controller accepts a goal; give up the command if it refuses."""
+        """Process whether the controller accepts a goal; give up the command if it refuses.
+
+        Nothing if a refused goal is of an earlier move. One that was cancelled meanwhile is
+        cancelled now.
+        """
         if not handle.accepted:
             if goal in self._goals:
                 self._goals.remove(goal)
@@ -324,7 +346,10 @@ class ActionLink:
             self.cancel()
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
-        """Give up if the newest goal failed; replaced and cancelled goals are no failures."""
+        """Give up if the newest goal failed; replaced and cancelled goals are no failures.
+
+        The reason names the result's error code (`CODES`) and the controller's text.
+        """
         goal.over = True
         # A goal that was replaced ends as cancelled: that is how it is meant.
         newest = bool(self._goals) and goal is self._goals[-1]
@@ -342,6 +367,7 @@ class ActionLink:
         self._give_up(f'{self._action}: the controller has given up a command ({why})')
 
     def _give_up(self, why: str) -> None:
+        """Cancel all goals, and call `failed` with the reason."""
         # What it had before may still be under way: an arm that refuses to be stopped, say.
         self.cancel()
         self._failed(why)
@@ -356,7 +382,10 @@ class ActionLink:
 
 
 def control_messages() -> tuple[Any, Any]:
-    """Return FollowJointTrajectory and JointTolerance; `InputError` if they are missing."""
+    """Return the types FollowJointTrajectory and JointTolerance of control_msgs.
+
+    Raises InputError, with how to install it, if control_msgs is missing.
+    """
     try:
         action = importlib.import_module('control_msgs.action').FollowJointTrajectory
         return action, importlib.import_module('control_msgs.msg').JointTolerance

@@ -47,7 +47,7 @@ class FakeLaserTrackerNode(RemasterNode):
         self.tracker.start()
 
     def close(self) -> None:
-        """Close the sockets."""
+        """Close the tracker's sockets and the World."""
         self.tracker.close()
         self.world.close()
 

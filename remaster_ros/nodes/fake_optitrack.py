@@ -58,7 +58,7 @@ class FakeOptiTrackNode(RemasterNode):
         self.server.start()
 
     def close(self) -> None:
-        """Close the sockets."""
+        """Close the server's sockets and the World."""
         self.server.stop()
         self.world.close()
 

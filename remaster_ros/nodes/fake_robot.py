@@ -101,7 +101,10 @@ class FakeRobotNode(RemasterNode):
         self._thread.start()
 
     def _run(self) -> None:
-        """Thread: publish states and the clock, and advance world time; skip what is late."""
+        """Thread: publish states and the clock, and advance world time; skip what is late.
+
+        The clock is published while it stands too, every `STANDING_CLOCK_WALL_S`.
+        """
         state_s, clock_s = 1.0 / self.p.joint_state_rate, self.world.rate / self.p.clock_rate
         state_due = clock_due = self.world.now()
         clock_wall, wait_s, moved = 0.0, 0.0, False
@@ -122,13 +125,20 @@ class FakeRobotNode(RemasterNode):
             wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 
     def _on_taken(self, message: Header) -> None:
-        """Record how far a process, by its id, has processed messages; ignore a malformed id."""
+        """Record how far a process, by its id, has processed messages; ignore a malformed id.
+
+        World time waits for it (`Pace`). ``frame_id``: the id, and `LEADS` for who leads the arm.
+        """
         pid, _, what = message.frame_id.partition(' ')
         if pid.isdecimal():
             self._pace.took(int(pid), seconds(message.stamp), leads=what == LEADS)
 
     def _publish_state(self) -> None:
-        """Publish a changed protective stop, and the joint states if the arm reports any."""
+        """Publish a changed protective stop, and the joint states if the arm reports any.
+
+        Each report is published `FakeArm.copies` times: twice if the World simulates doubled
+        reports.
+        """
         if self.arm.reports_stop != self._reported_stop:
             self._reported_stop = self.arm.reports_stop
             self._safety.publish(Bool(data=self._reported_stop))
@@ -143,7 +153,7 @@ class FakeRobotNode(RemasterNode):
             self._states.publish(message)
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        """Give a trajectory to the simulated arm; log an error if the arm drops it."""
+        """Give a trajectory to the simulated arm; log why, if the arm drops it."""
         points = [
             ServoPoint(
                 seconds(point.time_from_start),
@@ -157,7 +167,7 @@ class FakeRobotNode(RemasterNode):
             self.get_logger().error(f'trajectory dropped: {dropped}')
 
     def close(self) -> None:
-        """End the thread; remove a World that was drawn here."""
+        """End the thread and close the World; delete its folder if it was drawn here."""
         self._ending.set()
         self._thread.join()
         self.world.close()
@@ -166,7 +176,10 @@ class FakeRobotNode(RemasterNode):
 
 
 def _next_due(due: float, period: float, now: float) -> float:
-    """Return the first time after `now` of a period that was due at `due`, s; none are made up."""
+    """First time `due` + n `period` after `now`, s, n >= 0; `due` itself if that is to come.
+
+    Missed periods are skipped, not made up for.
+    """
     return due + period * max(math.floor((now - due) / period) + 1, 0)
 
 

@@ -44,7 +44,10 @@ def describe_launch(
 
 
 def _action(node: NodeToStart) -> Node:
-    """Return the launch action of a node, which is started again a few times if killed."""
+    """Return the launch action of a node, which is started again if it ends.
+
+    At most `MAX_RESPAWNS` times, each `RESPAWN_DELAY_S` after its end.
+    """
     return Node(
         package='remaster_ros',
         executable=node.executable,
@@ -61,7 +64,10 @@ def _action(node: NodeToStart) -> Node:
 
 
 def _on_exit(event: Any, context: Any) -> list[EmitEvent]:
-    """Shut down the launch if a node is configured wrongly; else [] (it may be started again)."""
+    """Shut down the launch if a node is configured wrongly (`exit_ends_launch`).
+
+    Else [], and launch starts the node again.
+    """
     if exit_ends_launch(event.process_name, event.returncode):
         return [EmitEvent(event=Shutdown(reason=f'{event.process_name} ended with status 2'))]
     return []

@@ -62,13 +62,15 @@ def real_nodes(
     joint_states: str = '',
     dashboard: str = 'false',
 ) -> list[NodeToStart]:
-    """Return the nodes of a real cell.
+    """Return the nodes of a real cell: those of `CORE`, one for each sensor, the live page.
 
-    ``sensors``: ``all``, or names of the cell file's sensors with commas; ``controller,
-    joint_states``: the arm's controller and the topic of its joint states; empty for
-    ros2_control's usual names in the namespace; ``dashboard``: ``true`` to serve the live page
-    too.
-    Raises InputError: a file is missing or wrong, or a node would run on its defaults.
+    ``cell, params``: paths of cell file and parameter file; ``sensors``: ``all``, or names of the
+    cell file's sensors with commas; ``controller, joint_states``: the arm's controller and the
+    topic of its joint states; empty for ros2_control's usual names in the namespace;
+    ``dashboard``: ``true`` to serve the live page too.
+
+    Raises InputError: a file is missing or wrong, a sensor is unknown or has no node in `params`,
+    or a node would run on its defaults.
     """
     for name, path in (('cell', cell), ('params', params)):
         if not Path(path).is_file():
@@ -135,7 +137,8 @@ def real_nodes(
 def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str]) -> dict[str, str]:
     """Return the paths of a section as absolute paths, relative to the folder of the file.
 
-    ``folders``: keys of the paths with their defaults; an empty path is left out.
+    ``params``: path of the file; ``folders``: keys of the paths with their defaults; an empty path
+    is left out.
     """
     home = Path(params).resolve().parent
     given = {key: str(section.get(key, default)) for key, default in folders.items()}
@@ -143,7 +146,11 @@ def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str])
 
 
 def fake_nodes(params: str, namespace: str = '', dashboard: str = 'false') -> list[NodeToStart]:
-    """Return the nodes of a fake cell and its fakes, whose clock is the namespace's own."""
+    """Return the nodes of a fake cell and its fakes, whose clock is the namespace's own.
+
+    ``params``: path of the parameter file; ``dashboard``: ``true`` for the live page too. Raises
+    InputError if there is no such file, or `dashboard` is neither true nor false.
+    """
     if not Path(params).is_file():
         raise InputError(f'params:={params}: there is no such file')
     names = (*ALL_NODES, PAGE) if _is_true('dashboard', dashboard) else ALL_NODES
@@ -153,17 +160,21 @@ def fake_nodes(params: str, namespace: str = '', dashboard: str = 'false') -> li
 
 
 def _is_true(name: str, text: str) -> bool:
-    """Whether a launch argument is 'true'; InputError if it is neither 'true' nor 'false'."""
+    """Whether a launch argument is 'true', in any case.
+
+    Raises InputError, with the argument's name, if it is neither 'true' nor 'false'.
+    """
     if text.lower() not in ('true', 'false'):
         raise InputError(f'{name}:={text}: true or false is needed')
     return text.lower() == 'true'
 
 
 def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, Any]]:
-    """Return the sections of a parameter file that hold in a namespace, by node.
+    """Return the sections of a parameter file that hold in a namespace, by name of the node.
 
-    Raises InputError: it is no parameter file, or has a section for none of our nodes in this
-    namespace: that node would run on its defaults.
+    Sections ``/**/NODE`` hold in every namespace; ``/**`` alone is left out. The values are those
+    below ``ros__parameters``. Raises InputError: it is no parameter file, or has a section for one
+    of our nodes in another namespace: that node would run on its defaults.
     """
     path = Path(params)
     try:
@@ -201,4 +212,5 @@ def exit_ends_launch(process: str, returncode: int | None) -> bool:
 
 
 def _where(namespace: str) -> str:
+    """Return ' in the namespace /NAME' for messages; '' for the root namespace."""
     return f' in the namespace /{namespace.strip("/")}' if namespace.strip('/') else ''

@@ -42,10 +42,11 @@ class TriggeredSensors:
         self._shots: dict[str, _Shot] = {}
 
     def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
-        """Send the requests that a pairing still needs, and report refusals to it.
+        """Send the requests that a pairing still needs, and report refusals to it, at once.
 
-        A request is repeated to a sensor that was absent meanwhile, and to one whose reading was
-        lost. ``absent``: sensor -> why; ``now``: time of the recorder's watchdogs, s.
+        A service that is missing for `MISSING_WALL_S` is a failure, as is a refusal. A request is
+        repeated to a sensor that was absent meanwhile, and to one whose reading was lost.
+        ``absent``: sensor -> why; ``now``: time of the recorder's watchdogs, s.
         """
         if pairing is not self._pairing:
             self._pairing, self._shots = pairing, {}
@@ -62,7 +63,10 @@ class TriggeredSensors:
                 pairing.fail(name, f'the service {client.srv_name} is not there')
 
     def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
-        """Report a refusal to the pairing; forget the request if its reading was lost."""
+        """Report a refusal to the pairing; forget the request if its reading was lost.
+
+        Nothing before the answer, and for `PATIENCE_WALL_S` after it.
+        """
         assert shot.future is not None
         response = shot.future.result() if shot.future.done() else None
         if response is None:
@@ -89,7 +93,11 @@ class MeasureCalls:
         self._called_wall = dict.fromkeys(self._clients, float('-inf'))
 
     def call(self, names: Collection[str], now: float) -> None:
-        """Request a measurement of these sensors, at most every 5 s; ``now``: wall time, s."""
+        """Request a measurement of these sensors, each at most every `MEASURE_EVERY_WALL_S`.
+
+        ``now``: wall time, s. Sensors without a service, or whose service is not ready, are left
+        out. Answers are ignored.
+        """
         for name, client in self._clients.items():
             due = now - self._called_wall[name] >= MEASURE_EVERY_WALL_S
             if name in names and due and client.service_is_ready():

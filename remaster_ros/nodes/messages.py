@@ -29,27 +29,32 @@ leaves it nearer to 1, and the squares are numbers."""
 
 
 def stamp_of(time_s: float) -> Time:
-    """Return a time in seconds as a stamp."""
+    """Return a time in seconds as a stamp, rounded to nanoseconds."""
     nanoseconds = round(time_s * 1e9)
     return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
 def duration_of(time_s: float) -> Duration:
-    """Return a duration in seconds as a message."""
+    """Return a duration in seconds as a message, rounded to nanoseconds."""
     nanoseconds = round(time_s * 1e9)
     return Duration(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
 
 def write_place(T: FloatArray, position: Any, turn: Any) -> None:
-    """Write a transform (4, 4) into the two halves of a Pose or Transform message."""
+    """Write a transform (4, 4) into the two halves of a Pose or Transform message.
+
+    Both are changed in place; ``turn``: the quaternion x, y, z, w.
+    """
     position.x, position.y, position.z = map(float, T[:3, 3])
     turn.x, turn.y, turn.z, turn.w = map(float, transforms.quaternion_xyzw(T[:3, :3]))
 
 
 def read_place(position: Any, turn: Any) -> FloatArray:
-    """Undo `write_place`; returns (4, 4).
+    """Read a transform (4, 4) from the two halves of a Pose or Transform message.
 
-    Raises InputError: no rotation, or a place that is not finite or farther than `FARTHEST_M`.
+    ``turn``: quaternion x, y, z, w of any length, since others do not normalise exactly. Raises
+    InputError: the quaternion's largest part is beyond `LARGEST_PART`, or below its reciprocal; or
+    a position is not finite or farther than `FARTHEST_M`.
     """
     place = np.array([position.x, position.y, position.z])
     quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
@@ -62,7 +67,7 @@ def read_place(position: Any, turn: Any) -> FloatArray:
 
 
 def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> TransformStamped:
-    """Return a transform (4, 4) as a message."""
+    """Return a transform (4, 4), of frame `child` in `parent`, as a message with the stamp 0."""
     message = TransformStamped()
     message.header.frame_id, message.child_frame_id = parent, child
     write_place(T_parent_child, message.transform.translation, message.transform.rotation)
@@ -70,7 +75,7 @@ def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> Tr
 
 
 def transform_array(message: TransformStamped) -> FloatArray:
-    """Undo `transform_message`; returns (4, 4)."""
+    """Return the transform of a message, (4, 4). Raises InputError as `read_place`."""
     return read_place(message.transform.translation, message.transform.rotation)
 
 
@@ -107,8 +112,10 @@ def waypoints_by_solution(
 ) -> dict[int, FloatArray]:
     """Group remaster/joint_waypoints by the solution that they lead to.
 
-    Returns index of the solution -> configurations to go through before it, rad, (n, k), n >= 1;
-    without those that a straight way leads to.
+    Returns index of the solution, from 0 -> configurations to go through before it, rad or m, (n,
+    k), n >= 1, joints in the order of `joint_names`; solutions with a straight way are left out,
+    {} if all are. Further joints of the message are ignored.
+
     Raises InputError: joints that are missing or named twice, points of the wrong length, not
     finite or out of order.
     """

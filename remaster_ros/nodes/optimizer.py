@@ -124,7 +124,7 @@ class PrecisionWatch:
             node.create_timer(STATE_EVERY_S, self._step, callback_group=group, clock=steady)
 
     def _on_record(self, record: EventRecord) -> None:
-        """Keep the states of the recorder and the planner."""
+        """Keep the recorder's state, and the planner's count of planned configurations."""
         match record.body:
             case RecorderState() as recorder:
                 self._recorder = recorder
@@ -132,7 +132,11 @@ class PrecisionWatch:
                 self._planned = planned
 
     def _step(self) -> None:
-        """Look at the precision once there are new observations; errors end in the state."""
+        """Look at the precision once there are new observations; errors become the state's text.
+
+        Timer callback. Nothing without a plan, for another session than the recorder's, or once
+        the goal is reached; another plan begins anew. A fault of this program is only logged.
+        """
         recorder, planned = self._recorder, self._planned
         if recorder is None or not (planned and recorder.plan and recorder.observations):
             return
@@ -154,7 +158,11 @@ class PrecisionWatch:
             self._node.get_logger().error(str(fault_of_this_program(error)))
 
     def _look(self, rule: StoppingRule, plan: str) -> None:
-        """Fit at each count of configurations reached since the last look; publish the result."""
+        """Fit at each count of configurations reached since the last look; publish the result.
+
+        Ends at the first count that is enough, which is logged. ``plan``: identifier for the
+        state. Raises as `read_session` and `StoppingRule.look`.
+        """
         session = read_session(self._folder)
         done = configurations(session)
         for count in rule.counts[len(self._looks) :]:
@@ -207,7 +215,11 @@ class Optimizer(RemasterNode):
         request: Trigger.Request,
         response: Trigger.Response,
     ) -> Any:
-        """Do a job for a service, one at a time; its error becomes the response's message."""
+        """Do a job for a service, one at a time; its error becomes the response's message.
+
+        ``work``: returns the file to open, the response's message, and the text for the status.
+        While another job runs, the request is refused.
+        """
         if not self._busy.acquire(blocking=False):
             response.message = 'a fit is under way'
             return response
@@ -223,7 +235,12 @@ class Optimizer(RemasterNode):
         return response
 
     def _fit(self) -> tuple[Path, str]:
-        """Return the file to open, and the text for the status."""
+        """Fit the session, save the result, publish the offsets; return report and text.
+
+        The report is the path of the file to open; what is implausible in the result is logged and
+        in the text. Raises RemasterError: the session, the priors or the folder cannot be used, or
+        the data do not allow a fit.
+        """
         out = Path(self.p.out)
         session = read_session(self.p.session)
         prepare_folder(out, FIT_FILE)
@@ -244,11 +261,19 @@ class Optimizer(RemasterNode):
         return report, '; '.join(('fitted', *result.implausible))
 
     def _priors(self) -> Priors | None:
-        """Priors of the file in the parameter `prior`; None if the parameter is empty."""
+        """Priors of the file in the parameter `prior`; None if the parameter is empty.
+
+        Raises InputError if the file is invalid.
+        """
         return read_priors(self.p.prior) if self.p.prior else None
 
     def _discover(self) -> tuple[Path, str]:
-        """Search the session for causes; return the report's path and a summary."""
+        """Search the session for causes, save the result; return the report's path and a summary.
+
+        Look-alikes that an earlier search of the same session had left open are decided too.
+        Raises RemasterError: the session or the folder cannot be used, or the data do not allow a
+        search.
+        """
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions
         from remaster_ros.discovery.discover import discover_session
@@ -279,13 +304,13 @@ class Optimizer(RemasterNode):
         return report, '; '.join(words)
 
     def _progress(self, stage: str, share: float) -> None:
-        """Show stage and share of a fit as the state; RemasterError if the node is ending."""
+        """Show stage and share, 0 to 1, of a fit as the state; RemasterError if closing."""
         if self._ending:
             raise RemasterError('stopped')
         self._state = f'{stage} {100 * share:.0f} %'
 
     def _publish_last(self) -> None:
-        """Publish the offsets of a fit from before this node was started.
+        """Publish the offsets of the fit.json in the folder `out`, of an earlier run.
 
         Nothing without such a file; a warning if it is unreadable.
         """
@@ -300,7 +325,10 @@ class Optimizer(RemasterNode):
         self._publish([row.joint for row in rows], *np.array([row.mean_and_std for row in rows]).T)
 
     def _publish(self, names: Sequence[str], offsets: FloatArray, std: FloatArray) -> None:
-        """Publish offsets and their standard deviations, rad or m, by joint name, one stamp."""
+        """Publish offsets and their standard deviations by joint name, latched, with one stamp.
+
+        ``names``: joints; ``offsets, std``: rad or m, in the order of `names`, (k,).
+        """
         stamp = self.get_clock().now().to_msg()
         for publisher, values in ((self._means, offsets), (self._stds, std)):
             message = JointState(name=list(names), position=values.tolist())

@@ -38,7 +38,8 @@ def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = N
 
     ``on_change``: called with all parameters when live ones are to change, in an executor's
     thread; from its return on the new ones hold. `InputError` refuses the change, with its text as
-    the reason.
+    the reason. None: all are read-only.
+
     Raises InputError: naming the node, the parameter and what it may be.
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
@@ -85,7 +86,11 @@ def _changed(
     current: T,
     parameters: Sequence[Any],
 ) -> T:
-    """Return the parameters with new values of live ones; refuse all others by name."""
+    """Return the parameters with new values of live ones.
+
+    ``current``: all parameters so far; ``parameters``: rclpy's, to be changed. Raises InputError
+    for a name that is unknown or not live, or a value that `check` refuses.
+    """
     for item in parameters:
         if item.name not in fields or not fields[item.name].metadata['live']:
             raise InputError(
@@ -97,7 +102,10 @@ def _changed(
 
 
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
-    """ROS descriptor of a parameter, with its description, unit, choices and range."""
+    """ROS descriptor of a parameter, with its description, unit, choices and range.
+
+    A range with a hole (``off``) becomes a range down to `off`; `check` looks at the hole.
+    """
     meta = field.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     descriptor = ParameterDescriptor(

@@ -131,7 +131,11 @@ class PosePlanner(RemasterNode):
         self.create_timer(0.05, self._step, clock=self.status.steady)
 
     def _resume(self) -> None:
-        """Restore the state that a planner before this one has left."""
+        """Restore the state that a planner before this one has left in the journal.
+
+        Nothing if there is no plan; else with a warning. A run is resumed later, by `_resume_run`,
+        and never if plans have to be confirmed.
+        """
         journal = self.journal
         if journal.tour is None:
             return
@@ -143,9 +147,9 @@ class PosePlanner(RemasterNode):
         self.get_logger().warning(f'{journal.path}: going on; {self.progress.describe()}')
 
     def _resume_run(self) -> None:
-        """Resume the run of a killed planner, if it certainly still lives.
+        """Resume the run of a killed planner, if it certainly still lives; wait until known.
 
-        Otherwise, once that is known, the run remains paused, and a warning says why.
+        If it does not live, the run remains paused, and a warning says why.
         """
         token, peers = self.run.left, self._peers
         silent_s, progress = silence_s(token), self.progress.describe()
@@ -172,18 +176,26 @@ class PosePlanner(RemasterNode):
         self._living = living
 
     def _end(self, state: str, why: str = '') -> None:
-        """End the run under way; `_step` writes that to the journal."""
+        """End the run under way in `state`, and publish that; `_step` writes it to the journal.
+
+        Nothing if no run is running. ``why``: shown to people.
+        """
         with self._lock:
             if self.run.end(state, why, only_from='running'):
                 self._follow_run()
 
     def _on_collect(self, request: Trigger.Request, response: Trigger.Response) -> Any:
+        """Serve a request to begin or resume the collection; see `_collect`."""
         return self._collect(response)
 
     def _on_inspection(
         self, kind: Inspection, request: Trigger.Request, response: Trigger.Response
     ) -> Any:
-        """Begin or resume an inspection; if it is complete, answer with the verdict."""
+        """Begin or resume an inspection; if it is complete, answer with the verdict.
+
+        Refused, with the reason in the response, while a run is running, in a session that holds
+        something else, and as `Inspections.refusal` and `Inspections.tour` say.
+        """
         tour, recorder = self.journal.tour, self._peers.recorder
         same_kind = tour is not None and tour.inspection == kind
         if same_kind and self.run.state == 'complete':
@@ -211,7 +223,12 @@ class PosePlanner(RemasterNode):
     def _collect(
         self, response: Trigger.Response, inspection: Callable[[], Tour] | None = None
     ) -> Any:
-        """Begin or resume a run; ``inspection``: plans an inspection instead of a collection."""
+        """Begin or resume a run, or refuse to; return the response, with success and a text.
+
+        ``inspection``: plans an inspection instead of a collection; None goes on with what is
+        planned. After a complete collection, measurements are added that separate causes, if any
+        are open.
+        """
         bridge, recorder = self._peers.bridge, self._peers.recorder
         further, plan = self._additions.next_plan(
             self.run.state, under_way=self.progress.measures_additions
@@ -243,7 +260,10 @@ class PosePlanner(RemasterNode):
     def _on_confirm(
         self, request: Trigger.Request, response: Trigger.Response, plan: str = ''
     ) -> Any:
-        """Confirm the plan on the page; ``plan``: its fingerprint, '' for any."""
+        """Serve a request to confirm the plan on the page; see `PlanConfirmation.confirm`.
+
+        ``plan``: the fingerprint to confirm, '' for that of the page.
+        """
         response.success, response.message = self._preview.confirm(plan)
         if response.success and self.run.state != 'running':
             self.run.why = response.message
@@ -251,7 +271,10 @@ class PosePlanner(RemasterNode):
         return response
 
     def _offer(self, plan: str) -> None:
-        """Create a service that confirms this plan only; it remains, to refuse later calls."""
+        """Create a service that confirms this plan only; it remains, to refuse later calls.
+
+        ``plan``: fingerprint; nothing for '' or if the service exists.
+        """
         if plan and plan not in self._offered:
             self._offered.add(plan)
             path = f'remaster/confirm/{service_name(plan)}'
@@ -266,7 +289,10 @@ class PosePlanner(RemasterNode):
         return response
 
     def _on_stop(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Stop the arm, end the run, and retract the announced pose."""
+        """Serve a request to stop: stop the arm, end the run, and retract the announced pose.
+
+        It always succeeds.
+        """
         with self._lock:
             # The command first: no later failure may keep the arm moving.
             self._poses.stop()
@@ -283,11 +309,14 @@ class PosePlanner(RemasterNode):
         )
 
     def _listen_again(self) -> None:
-        """Subscribe to the joint states until the next one arrives."""
+        """Subscribe to the joint states until the next one of the arm arrives."""
         self._joint_states = self._joint_states or self._listen_to_the_arm()
 
     def _on_joint_state(self, message: JointState) -> None:
-        """Set the arm's configuration before the first pose; later /remaster/settled does."""
+        """Set the arm's configuration before the first pose, then end the subscription.
+
+        Messages of other joints are ignored. Later /remaster/settled sets the configuration.
+        """
         if not self._order.concerns(message):
             return
         self._on_settled(message)
@@ -296,7 +325,10 @@ class PosePlanner(RemasterNode):
             self._joint_states = None
 
     def _on_settled(self, message: JointState) -> None:
-        """Set the arm's configuration; `run.why` tells what is wrong with a message."""
+        """Set the arm's configuration, the wanted one if the bridge corrects.
+
+        An invalid message leaves it as it is; `run.why` tells what is wrong.
+        """
         try:
             # The nominal joint angles of the tool's pose, if the bridge corrects.
             wanted = wanted_of(message, self._order.names)
@@ -305,10 +337,15 @@ class PosePlanner(RemasterNode):
             self.run.why = str(error)
 
     def _on_registration(self, message: TransformStamped) -> None:
+        """Keep a sensor's registration, T_R_N (4, 4). Raises InputError as `transform_array`."""
         self.progress.T_R_N[message.child_frame_id] = transform_array(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Update the state by an event or state of another node."""
+        """Update the state by an event or state of another node.
+
+        A halt, a bridge that asks for collect, and a changed setup that stops end the run as
+        paused; an optimizer that knows enough of this plan ends the poses to fit.
+        """
         now = time.monotonic()
         self._peers.take(record, now)
         self._models.take(record, now)
@@ -342,7 +379,12 @@ class PosePlanner(RemasterNode):
                     self._inspections.evaluate(kind)
 
     def _step(self) -> None:
-        """Announce the next visit once every solution of the last one has its outcome."""
+        """Announce the next visit once every solution of the last one has its outcome.
+
+        Timer callback, every 50 ms, and after a recorder's state that decides a visit. It also
+        keeps the run alive, writes the state, resumes a run, draws the preview while none runs,
+        and repeats an announcement that a node has missed. An error ends the run as failed.
+        """
         living = self._living
         if living is not None:
             living.stay_alive()
@@ -386,7 +428,11 @@ class PosePlanner(RemasterNode):
             self._announce(visit)
 
     def _hindrance(self, now: float) -> str:
-        """Return why no pose can be announced now; '' if one can."""
+        """Return why no pose can be announced now; '' if one can. ``now``: `time.monotonic`, s.
+
+        In this order: no time, another planner, another arm's model in a peer, peers missing, and,
+        once before the first motion, the findings of the preflight.
+        """
         if self.clock_trouble:
             return self.clock_trouble
         if not self.status.alone(now):
@@ -407,7 +453,11 @@ class PosePlanner(RemasterNode):
         return ''
 
     def _announce(self, visit: PoseVisit) -> None:
-        """Publish a visit if its plan is confirmed, and the run is under way."""
+        """Publish a visit if its plan is confirmed, and the run is under way.
+
+        If it is not confirmed, the run ends as paused, and the page is drawn again. Before the
+        first visit of a collection the plan is described in an event.
+        """
         tour = self.journal.tour
         if not self._preview.allows(tour):
             self._preview.withdraw()
@@ -429,7 +479,10 @@ class PosePlanner(RemasterNode):
                 self._announcements.announced(stamp, time.monotonic())
 
     def _repeat(self) -> None:
-        """Repeat the announcement of the visit under way, for a node that missed it."""
+        """Repeat the announcement of the visit under way, for a node that missed it.
+
+        Nothing if no run is running.
+        """
         with self._lock:
             if self.run.state == 'running':
                 self._poses.repeat(self.status)
@@ -442,7 +495,7 @@ class PosePlanner(RemasterNode):
         self.journal.record_state(state, token)
 
     def _is_written(self) -> bool:
-        """Retry a failed write, at most once in RETRY_WALL_S; return whether all is written.
+        """Retry failed writes, at most once in `RETRY_WALL_S`; return whether all is written.
 
         False between two tries.
         """
@@ -455,7 +508,10 @@ class PosePlanner(RemasterNode):
         return not self.journal.trouble
 
     def _summary(self) -> Summary:
-        """Return the state of the planner for the status."""
+        """Return the state of the planner for the status, with what hinders it as the message.
+
+        The level is error after a failed run, warn with a hindrance, else ok.
+        """
         run, trouble = self.run, self.journal.trouble
         full = f'waiting for room on the disk: {trouble}' if trouble else ''
         values = {

@@ -108,7 +108,7 @@ class Recorder(RemasterNode):
         bag.subscribe_rest()
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
-        """Record joint states; with two publishers, report the rival instead."""
+        """Record joint states; with two publishers of the arm's joints, report the rival."""
         self._taken.take(message.header.stamp)
         self._states.note(message, info)
         if rival := self._states.rival():
@@ -117,7 +117,11 @@ class Recorder(RemasterNode):
             self.recorder.take_joints(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Hand an event or state of another node on."""
+        """Count the record, and hand an event or state of another node on.
+
+        A sensor's report goes to `sensors`, all others to the session recorder; records of this
+        start of the node are left out.
+        """
         self._records[taken_key(record)] += 1
         if isinstance(record.body, events.SensorReport):
             self.sensors.take(record, record.body)
@@ -125,10 +129,10 @@ class Recorder(RemasterNode):
             self.recorder.take_record(record)
 
     def _on_taken(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Answer how many messages of each topic were received, for which a replay waits.
+        """Serve the number of messages taken of each topic, as JSON, for which a replay waits.
 
         Several nodes publish on remaster/events beside the replay: its records are counted by the
-        start times of their nodes.
+        start times of their nodes (`taken_key`).
         """
         topics = {k: n for k, n in self.keeper.bag.taken.items() if k != f'/{EVENTS}'}
         response.success = True
@@ -136,7 +140,12 @@ class Recorder(RemasterNode):
         return response
 
     def _look(self) -> None:
-        """Trigger sensors, reject overdue readings, and publish why the arm has to wait."""
+        """Trigger sensors, reject overdue readings, and publish why the arm has to wait.
+
+        Timer callback, every 50 ms. It also repeats failed writes; the state is published when
+        waiting begins or ends, and after a repair. With messages from a bag no sensor is
+        triggered.
+        """
         if self.keeper.look():
             self.status.publish()
         recording = self.recorder.recording
@@ -152,7 +161,11 @@ class Recorder(RemasterNode):
             self.status.publish()
 
     async def _on_register(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Register with the present position of the arm; the third point completes it."""
+        """Register with the present position of the arm; the third point completes it.
+
+        The answer comes when the reading has ended. Refused while a reading or a write is under
+        way, before the first joint states, and in a closed session.
+        """
         if self.keeper.full or self.recorder.recording.pairing is not None:
             response.message = 'a reading is under way; try again when it is done'
             return response
@@ -170,7 +183,7 @@ class Recorder(RemasterNode):
         return response
 
     def _summary(self) -> Summary:
-        """Return the state of the recorder for the status."""
+        """Return the state of the recorder for the status: warn with a trouble, else ok."""
         recorder, recording = self.recorder, self.recorder.recording
         busy = self.keeper.full or recording.pairing is not None
         state = 'closed' if self.journal.closed else 'measuring' if busy else 'waiting'
@@ -214,7 +227,10 @@ class Recorder(RemasterNode):
         return Summary('warn' if trouble else 'ok', trouble or state, values, report)
 
     def close(self) -> None:
-        """Close the session; its records remain readable."""
+        """Close the session as stopped; its records remain readable.
+
+        A registration by hand under way is cancelled. A full disk is logged, not raised.
+        """
         if self._by_hand is not None:
             self._by_hand.cancel()
         try:
@@ -230,9 +246,11 @@ class _Outlet(Outlet):
         self._node = node
 
     def event(self, event: events.Event) -> None:
+        """Publish an event of the recorder."""
         self._node.status.event(event)
 
     def state(self) -> None:
+        """Publish the recorder's state now."""
         self._node.status.publish()
 
     def registered(self, sensor: str, T_R_N: FloatArray) -> None:
@@ -248,11 +266,12 @@ class _Outlet(Outlet):
             self._node.sensors.trigger(pairing)
 
     def ended_by_hand(self, ended: EndedReading) -> None:
+        """Answer a registration by hand with its reading; nothing if none is under way."""
         if self._node._by_hand is not None:
             self._node._by_hand.set_result(ended)
 
     def log(self, level: int, text: str) -> None:
-        """Log a line with the severity of `level`."""
+        """Log a line as error, warning or info; `level` as in `logging`."""
         logger = self._node.get_logger()
         # Separate calls: rclpy refuses a line of code that logs with several severities.
         if level >= logging.ERROR:

@@ -127,7 +127,11 @@ class Replay(RemasterNode):
         self._thread.start()
 
     def _publisher(self, topic: str, type_name: str) -> Publisher:
-        """Return a publisher of a topic that was recorded under this name."""
+        """Return a publisher of a topic that was recorded under this name.
+
+        Its name is relative, for any namespace. Reliable, and latched if the topic is in
+        `LATCHED_TOPICS`. Raises InputError if the message type is not installed.
+        """
         latched = topic in LATCHED_TOPICS
         qos = QoSProfile(
             depth=DEPTH,
@@ -138,7 +142,7 @@ class Replay(RemasterNode):
         return self.create_publisher(message_class(type_name), topic.lstrip('/'), qos)
 
     def _play(self) -> None:
-        """Thread: replay the bag; `finished` at its end, else `failure` is the error."""
+        """Thread: replay the bag; `finished` at its end, else `failure` is the RemasterError."""
         try:
             self._wait_for_subscriber()
             self._refuse_live()
@@ -152,7 +156,10 @@ class Replay(RemasterNode):
             self.failure = error
 
     def _wait_for_subscriber(self) -> None:
-        """Wait for a subscriber of `wait_for`; InputError if none comes in `wait_s`."""
+        """Wait for a subscriber of `wait_for`; InputError if none comes in `wait_s`.
+
+        Then, or without such a topic, wait `DISCOVERY_S`. Ends early if the node is to end.
+        """
         topic = self.p.wait_for
         if not topic:
             self._ending.wait(DISCOVERY_S)
@@ -190,7 +197,11 @@ class Replay(RemasterNode):
                 raise InputError(_live(info, f'listens to {name}'))
 
     def _look_who_listens(self, publisher: Publisher) -> None:
-        """Wait for a new subscriber to be known, and raise InputError if it moves an arm."""
+        """Raise InputError if a new subscriber of a topic that moves an arm is a live node.
+
+        If their number has changed, wait `NEWCOMER_S` for their other endpoints, and check as
+        `_refuse_live`.
+        """
         count = publisher.get_subscription_count()
         known = self._listeners.get(publisher.topic_name)
         if count != known:
@@ -201,7 +212,11 @@ class Replay(RemasterNode):
             self._listeners[publisher.topic_name] = count
 
     def _send_all(self) -> None:
-        """Publish the bag's messages at `rate` times their speed, until the node is to end."""
+        """Publish the bag's messages at `rate` times their speed, until the node is to end.
+
+        A delay of more than `BEHIND_S` is not made up for. Topics left out are skipped. Raises
+        InputError if the graph becomes live.
+        """
         start_wall = first = None
         looked = shown = time.monotonic()
         last = self._reader.whole.last_ns or 0
@@ -250,14 +265,15 @@ class Replay(RemasterNode):
         self.get_logger().info(f'{self.sent} messages published')
 
     def _await_recorder(self) -> None:
-        """Wait until a recorder, if there is one, has taken the messages sent; count drops."""
+        """Wait until a recorder, if there is one, has taken the messages sent; count losses."""
         for topic, count in self._acknowledged.wait(self._ending).items():
             self._dropped[topic] += count
 
     def _await_taken(self, topic: str) -> None:
         """Wait until all subscribers of a topic have its messages; after `TAKEN_S` count drops.
 
-        Later messages would take the places of those that a slow subscriber has not taken yet.
+        All messages sent since the last wait count as dropped then. Later messages would take the
+        places of those that a slow subscriber has not taken yet.
         """
         publisher, count = self._publishers_by_topic[topic], self._untaken.pop(topic, 0)
         if not self._ending.is_set() and not publisher.wait_for_all_acked(
@@ -266,7 +282,10 @@ class Replay(RemasterNode):
             self._dropped[topic] += count
 
     def _require_all(self) -> None:
-        """Raise an `InsufficientDataError` with the topics of which something was dropped."""
+        """Wait for the last messages; InsufficientDataError if any were dropped or torn off.
+
+        The error has the topics and counts. Nothing is raised if the node is to end.
+        """
         for topic in list(self._untaken):
             self._await_taken(topic)
         self._await_recorder()
@@ -290,7 +309,7 @@ class Replay(RemasterNode):
             self._clock_publisher.publish(ClockMessage(clock=stamp_of(time_ns * 1e-9)))
 
     def close(self) -> None:
-        """Stop publishing."""
+        """Stop publishing, and wait for the thread, 2 s at most."""
         self._ending.set()
         self._thread.join(2.0)
 
@@ -310,7 +329,8 @@ class Acknowledged:
     def begin(self, wait_s: float, ending: threading.Event) -> None:
         """Detect a recorder, and note how many messages it has taken already.
 
-        Raises InputError: it is there and does not answer.
+        Nothing if no node of that name subscribes to remaster/settled. ``ending``: set when the
+        node ends. Raises InputError: it is there and its service is not within `wait_s`.
         """
         settled = self._node.resolve_topic_name(IN_ORDER[0].lstrip('/'))
         subscribers = self._node.get_subscriptions_info_by_topic(settled)
@@ -327,7 +347,10 @@ class Acknowledged:
         self._before = self._ask(ending)
 
     def _ask(self, ending: threading.Event) -> dict[str, int] | None:
-        """Return how many messages a recorder has taken, by topic; None without an answer."""
+        """Return how many messages a recorder has taken, by topic.
+
+        None without an answer in `TAKEN_S`, or if `ending` is set.
+        """
         answered = threading.Event()
         future = self._client.call_async(Trigger.Request())
         future.add_done_callback(lambda _: answered.set())
@@ -342,7 +365,8 @@ class Acknowledged:
     def wait(self, ending: threading.Event) -> dict[str, int]:
         """Wait until the recorder has taken all messages sent since the last call.
 
-        Returns the number not taken by topic, if none were taken for `TAKEN_S`; {} if all were.
+        Returns the number not taken, by topic, if none were taken for `TAKEN_S`; {} if all were,
+        without a recorder, or if `ending` is set. `sent` is empty afterwards.
         """
         if self._before is None or not self.sent:
             return {}
@@ -382,7 +406,7 @@ def _record(data: bytes) -> events.EventRecord | None:
 
 
 def _live(info: TopicEndpointInfo, does: str) -> str:
-    """Error message that a node makes this graph live; ``does``: its doing as a phrase."""
+    """Error message that a node makes this graph live; ``does``: its doing, as 'publishes X'."""
     return (
         f'replay: this graph is live: {node_of(info)} {does}; end it, or replay in another ROS '
         'domain (ROS_DOMAIN_ID) or namespace'

@@ -44,7 +44,11 @@ class OnlyPublisher:
         self._alive = 0
 
     def trouble(self) -> str:
-        """Return a sentence on the topic's publishers if they are too many, or ''."""
+        """Return a sentence on the topic's publishers if they are too many; '' if not.
+
+        With publishers without a lease all listed count at once. If all have one, those that are
+        alive count, and '' is returned until `COUNT_WALL_S` after several were first listed.
+        """
         if self._node.count_publishers(self._topic) <= self._allowed:
             self._several_wall = None
             return ''
@@ -85,6 +89,7 @@ class OnlyPublisher:
             )
 
     def _on_liveliness(self, change: QoSLivelinessChangedInfo) -> None:
+        """Keep the number of publishers whose lease is alive."""
         self._alive = change.alive_count
 
     def _words(self, listed: list[TopicEndpointInfo]) -> str:
@@ -99,6 +104,7 @@ class OnlyPublisher:
 
 
 def _has_lease(info: TopicEndpointInfo) -> bool:
+    """Whether a publisher has a liveliness lease (of less than an hour)."""
     # Without a lease it lasts some hundred years.
     return bool(info.qos_profile.liveliness_lease_duration.nanoseconds < 3600 * 10**9)
 
@@ -128,14 +134,19 @@ class ArmStates:
         self.others = ''
 
     def take(self, message: JointState, info: Mapping[str, Any]) -> FloatArray | None:
-        """Return the arm's positions, rad, (k,); None from a message of another device.
+        """Return the arm's positions, rad or m, (k,); None from a message of another device.
 
-        Raises as `JointOrder.positions`.
+        ``info``: rclpy's of the message. Raises InputError as `JointOrder.positions`. Notes a
+        rival too.
         """
         return self._order.positions(message) if self.note(message, info) else None
 
     def note(self, message: JointState, info: Mapping[str, Any]) -> bool:
-        """Note a rival publisher of joint states; return whether they are of this arm."""
+        """Note a rival publisher of joint states; return whether the message is of this arm.
+
+        A rival shows by `NUMBER` in `info`, where it does not increase from message to message. A
+        message that names no joint of the arm sets `others`.
+        """
         if not self._order.concerns(message):
             found = ', '.join(message.name) or 'no joints'
             self.others = (
@@ -150,7 +161,10 @@ class ArmStates:
         return True
 
     def rival(self) -> str:
-        """Return that the arm's joints come from several nodes, and who publishes there; ''."""
+        """Return that the arm's joints come from several publishers, with the nodes; '' if not.
+
+        Until `hold_s` after a rival was noticed; by the graph if messages have no numbers.
+        """
         if self._is_counted:
             # Nothing but the graph tells publishers apart.
             return self._only.trouble()

@@ -258,7 +258,10 @@ class Parameters(SimulationParameters):
         return '' if self.emergency_stop_topic == NO_TOPIC else self.emergency_stop_topic
 
     def raised_from(self, before: Parameters) -> str:
-        """Return the name of a speed limit that is higher than before, or ''; 0 is no limit."""
+        """Return the name of the first speed limit that is higher than in `before`; '' if none is.
+
+        Speed share first; a Cartesian limit of 0 counts as infinite.
+        """
         if self.speed_share > before.speed_share:
             return 'speed_share'
         now, then = (p.cartesian_speed_limit_m_s or np.inf for p in (self, before))
@@ -267,7 +270,8 @@ class Parameters(SimulationParameters):
     def correction(self, cell: Workcell, chain: SerialChain) -> CorrectionInUse | None:
         """Return the correction in use, None if there is none.
 
-        Raises InputError if it is not of this arm, too large, or the arm has a prismatic joint.
+        Raises InputError if the file is invalid, not of this arm, or changes a joint by too much
+        (`compensation.in_use.MOST_DEG`), or the arm has a prismatic joint.
         """
         if not self.compensation:
             return None
@@ -333,7 +337,12 @@ class EmergencyLink:
             node.create_subscription(Bool, self.topic, self._on_message, qos)
 
     def trouble(self) -> str:
-        """Return why the state of the safety circuit is unknown (silent topic), or ''."""
+        """Return why the state of the safety circuit is unknown, or ''.
+
+        It is if no message has come, no publisher is left, or the last `PERIODIC` messages came
+        regularly (at most `silence_s` apart) and the next one is late by more than that. ''
+        without a topic.
+        """
         if not self.topic:
             return ''
         if not self._stamps:
@@ -348,6 +357,7 @@ class EmergencyLink:
         return ''
 
     def _on_message(self, message: Bool) -> None:
+        """Note the time of a message, and hand its value on."""
         self._stamps.append(time.monotonic())
         self._on_state(message.data)
 
@@ -471,7 +481,10 @@ class RobotBridge(RemasterNode):
             )
 
     def _on_parameters(self, p: Parameters) -> None:
-        """Use other speed limits; raises InputError if one is raised while a collection runs."""
+        """Use other speed limits, from now on; a move under way is stopped and goes on with them.
+
+        Raises InputError if one is raised while a collection runs.
+        """
         raised = p.raised_from(self.p)
         if raised and self.supervisor.under_way:
             raise InputError(
@@ -487,7 +500,11 @@ class RobotBridge(RemasterNode):
         )
 
     def on_fault(self, error: Exception) -> None:
-        """Halt the arm after a fault of this program, as its state may be inconsistent."""
+        """Halt the arm after a fault of this program, as its state may be inconsistent.
+
+        The fault is logged as in `RemasterNode.on_fault`, and the halt written to its file. If the
+        halt itself fails, the controller's goals are cancelled.
+        """
         why = str(fault_of_this_program(error))
         super().on_fault(error)
         if not hasattr(self, '_closing'):
@@ -507,7 +524,7 @@ class RobotBridge(RemasterNode):
     # What comes in
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Tell the supervisor of states of planner and recorder, and of recorded poses."""
+        """Tell the supervisor of states of planner and recorder, and of recorder's answers."""
         now = self.steady_s()
         self._models.take(record, now)
         match record.body:
@@ -524,7 +541,7 @@ class RobotBridge(RemasterNode):
                 self._do(self.supervisor.answered(solution, now))
 
     def _on_description(self, message: String) -> None:
-        """Compare a published robot description with the URDF of the cell."""
+        """Keep how a published robot description contradicts the URDF of the cell; '' if not."""
         why = difference(self.chain, message.data)
         self._described = why and (
             f'{self.resolve_topic_name(DESCRIPTION)} is not the URDF of the cell, '
@@ -532,13 +549,20 @@ class RobotBridge(RemasterNode):
         )
 
     def _model_trouble(self, now: float) -> str:
+        """Return how a peer or the robot's description is of another arm; '' if none is."""
         return self._models.trouble(now) or self._described
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
+        """Keep the waypoints, for the solutions with the same stamp."""
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
-        """Process the joint solutions of a pose; a repeated announcement is ignored."""
+        """Process the joint solutions of a pose: correct them, and have the supervisor plan them.
+
+        A repeated announcement (same stamp and solutions) is ignored, an invalid message dropped
+        with an error in the log. Solutions that cannot be corrected are refused, each with its
+        reason. A message without points is a stop.
+        """
         try:
             targets = solutions_of(message, self.chain.joint_names)
             belongs = self._waypoints.header.stamp == message.header.stamp
@@ -586,7 +610,10 @@ class RobotBridge(RemasterNode):
         self._taken.take(message.header.stamp)
 
     def _take_report(self, message: JointState, info: Mapping[str, Any]) -> None:
-        """Give joint states to the supervisor; doubt those that are invalid or of a rival."""
+        """Give joint states to the supervisor; doubt those that are invalid or of a rival.
+
+        Without a time of the node's clock they are left out.
+        """
         now = self.steady_s()
         if self.clock_trouble:
             self._do(self.supervisor.observe('clock', self.clock_trouble, now))
@@ -608,10 +635,11 @@ class RobotBridge(RemasterNode):
         self._do(self.supervisor.report(report))
 
     def _on_emergency_stop(self, stopped: bool) -> None:
+        """Tell the supervisor whether the robot's own safety stops it."""
         self._do(self.supervisor.emergency(stopped, self.steady_s()))
 
     def _on_clear_halt(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Serve a request to clear a halt, also in its file; or say why it is refused."""
+        """Serve a request to clear a halt, also in its file; or answer why it is refused."""
         refusal = self.supervisor.clear_halt()
         response.success = not refusal
         response.message = refusal or 'cleared; /remaster/collect goes on'
@@ -623,7 +651,10 @@ class RobotBridge(RemasterNode):
         return response
 
     def _watch(self) -> None:
-        """Tell the supervisor of rivals, model, controller, clock and safety, each or ''."""
+        """Tell the supervisor of rivals, model, controller, clock and safety, each trouble or ''.
+
+        Timer callback, every `WATCH_WALL_S`.
+        """
         now = self.steady_s()
         others = (only.trouble() for only in self._only)
         rivals = self._states.rival() or next(filter(None, others), '')
@@ -640,13 +671,20 @@ class RobotBridge(RemasterNode):
             self._do(self.supervisor.observe(name, trouble, now))
 
     def _keeps_stamps(self) -> bool:
-        """Whether the controller is known to keep the stamps of trajectories."""
+        """Whether the controller keeps the stamps of trajectories, by parameter or topic.
+
+        The parameter auto asks whether the controller publishes its state (`ControllerStates`).
+        """
         if self.p.trajectory_stamps != 'auto':
             return self.p.trajectory_stamps == 'kept'
         return self._states_of_controller.is_there()
 
     def _controller_trouble(self, now: float) -> str:
-        """Return why a command would be lost; ''."""
+        """Return why a command would be lost, or another client commands; '' if neither.
+
+        Makes the link to the controller once this bridge is the only one of its name. A controller
+        counts `MATCHED_WALL_S` after it was seen to listen. ``now``: `time.monotonic`, s.
+        """
         if self._controller is None:
             if not self.status.alone(now):
                 return 'looking for another robot_bridge of this name'
@@ -665,13 +703,19 @@ class RobotBridge(RemasterNode):
         return self._foreign.trouble()
 
     def _on_given_up(self, why: str) -> None:
+        """Log why the controller has given up a command, and tell the supervisor."""
         self.get_logger().error(why)
         self._do(self.supervisor.given_up(why))
 
     # What goes out
 
     def _do(self, actions: list[Action]) -> None:
-        """Carry out the supervisor's actions in order; late commands are not published."""
+        """Carry out the supervisor's actions in order; late commands are not published.
+
+        Path checks and the halt file go to the background; commands to the controller; outcomes to
+        events, counts and log. The supervisor is told of a command that is late (`_is_late`).
+        Moves are left out once the node is closing.
+        """
         stops = any(isinstance(action, Stop) for action in actions)
         for action in actions:
             match action:
@@ -716,7 +760,10 @@ class RobotBridge(RemasterNode):
         self._keep_end()
 
     def _tell_missed(self) -> None:
-        """Publish that the arm stops, once for each piece of a move that came too late."""
+        """Publish and log that the arm stops if pieces of its move have come too late.
+
+        Nothing if none has since the last call.
+        """
         if self.supervisor.missed == self._missed:
             return
         self._missed = self.supervisor.missed
@@ -726,7 +773,10 @@ class RobotBridge(RemasterNode):
         self.get_logger().warning(f'the arm stops: {reason}')
 
     def _keep_end(self) -> None:
-        """Write down where the last command leads, for a bridge after this one."""
+        """Write down where the last command leads, for a bridge after this one, in the background.
+
+        Nothing in a simulation, before the first command, or if it is written already.
+        """
         end, following = self.supervisor.end, self.supervisor.next_end
         if not self._keeps_end or end is None or end is self._kept_end:
             return
@@ -760,7 +810,11 @@ class RobotBridge(RemasterNode):
             raise
 
     def _publish(self, admitted: Admitted, kind: str = 'move', begins_s: float = 0.0) -> None:
-        """Publish a trajectory that the gate has admitted; nothing else goes to a controller."""
+        """Publish a trajectory that the gate has admitted; nothing else goes to a controller.
+
+        ``kind``: move, renewal or stop; ``begins_s``: its stamp, by the robot's clock, s; 0 for at
+        once.
+        """
         # A stop is a trajectory too: an empty one is refused by some versions of
         # joint_trajectory_controller, and the arm goes on.
         message = JointTrajectory(joint_names=list(self.chain.joint_names))
@@ -780,7 +834,10 @@ class RobotBridge(RemasterNode):
         self._controller.send(message, kind)
 
     def _on_commanded(self, drive: Drive) -> None:
-        """Count and publish a move to a solution; log a long probe move."""
+        """Count and publish a move to a solution; log a probe longer than `PROBE_S`.
+
+        Other moves than those to a solution (`solution` < 0) are not counted.
+        """
         solution, duration_s = drive.solution, drive.admitted.waypoints[-1].time_s
         if solution == PROBE and duration_s > PROBE_S:
             self.get_logger().info(
@@ -799,18 +856,25 @@ class RobotBridge(RemasterNode):
         )
 
     def _on_path(self, number: int, answer: PathAnswer | Exception) -> None:
-        """Give the answer of a path check to the supervisor; an exception as 'no path'."""
+        """Give the answer of a path check to the supervisor; an exception counts as 'no path'.
+
+        ``number``: of the check, by which the supervisor knows an outdated answer.
+        """
         if isinstance(answer, Exception):
             self.get_logger().error(f'the path could not be checked: {answer!r}')
             answer = PathAnswer(None, f'it could not be checked ({answer})')
         self._do(self.supervisor.path_found(number, answer, self.steady_s()))
 
     def _on_written(self, result: object) -> None:
+        """Log an error if `result` is the exception of writing the halt file."""
         if isinstance(result, Exception):
             self.get_logger().error(f'{self._halt_file.path}: the halt is not kept ({result})')
 
     def _announce(self, settled: Settled) -> None:
-        """Publish where the arm has settled, with wanted positions if a correction is on."""
+        """Publish where the arm has settled, with wanted positions if a correction is on.
+
+        Wanted are the commanded positions without the correction's change, named with `WANTED`.
+        """
         self._settled_wall = self.steady_s()
         self.counts['settled'] += 1
         names, q = list(self.chain.joint_names), settled.q
@@ -855,7 +919,7 @@ class RobotBridge(RemasterNode):
         return Summary(level, blocked or text, values, state)
 
     def close(self) -> None:
-        """Leave the arm standing still."""
+        """Stop the arm, and wait for the controller's answer and for files to be written."""
         self._closing = True
         self._do(self.supervisor.planner_is('gone: the bridge stops', self.steady_s()))
         if self._controller is not None:

@@ -85,7 +85,8 @@ class RemasterNode(Node):
     ) -> Subscription:
         """As in rclpy, without default event handlers.
 
-        A message for which the callback raises InputError is left out, with a line in the log.
+        A message for which the callback raises InputError is dropped, with a line in the log
+        (`on_unreadable`).
         """
         kwargs.setdefault(
             'event_callbacks', SubscriptionEventCallbacks(use_default_callbacks=False)
@@ -107,7 +108,10 @@ class RemasterNode(Node):
         return super().create_service(srv_type, srv_name, _answering(self, callback), **kwargs)
 
     def failed(self, error: Exception, response: Any) -> Any:
-        """Return a Trigger response with the reason why a service has failed, in one line."""
+        """Return the Trigger response, without success, with the reason of a failure in one line.
+
+        ``response``: changed in place. An error that is no RemasterError goes to `on_fault` too.
+        """
         response.success, response.message = False, str(error)
         if not isinstance(error, RemasterError):
             response.message = str(fault_of_this_program(error))
@@ -117,7 +121,8 @@ class RemasterNode(Node):
     def on_fault(self, error: Exception) -> None:
         """Report an exception that a callback has not caught, with its place in the code.
 
-        A node that leads an arm stops and halts the arm here, and lives on.
+        Each text is logged once, `MOST_FAULTS` at most. The node ends with it (`failure`) unless
+        it outlives faults. A node that leads an arm stops and halts the arm here, and lives on.
         """
         fault = fault_of_this_program(error)
         # The same message may come a thousand times a second.
@@ -128,7 +133,10 @@ class RemasterNode(Node):
             self.failure = fault
 
     def on_unreadable(self, name: str, error: Exception) -> None:
-        """Report a message, request or answer that cannot be read, and is dropped."""
+        """Log that a message, request or answer cannot be read, and is dropped.
+
+        ``name``: topic or service. Each text is logged once, `MOST_FAULTS` at most.
+        """
         text = str(error)[:LONGEST_TEXT] if isinstance(error, RemasterError) else ''
         why = f'{name}: a message is left out: {text or type(error).__name__}'
         if why not in self._faults and len(self._faults) < MOST_FAULTS:
@@ -154,7 +162,11 @@ class RemasterNode(Node):
 
 
 def fault_of_this_program(error: Exception) -> RemasterError:
-    """Return the error to report for an exception that was not foreseen."""
+    """Return the error to report for an exception that was not foreseen.
+
+    Its text has type, message (`LONGEST_TEXT` characters) and place. With the environment variable
+    `TRACEBACK` the traceback is printed.
+    """
     if os.environ.get(TRACEBACK):
         traceback.print_exception(error)
     text = ' '.join(str(error).split())
@@ -166,7 +178,10 @@ def fault_of_this_program(error: Exception) -> RemasterError:
 
 
 def _place_of(error: Exception) -> str:
-    """Return file, line and function of the innermost frame of this package, for a report."""
+    """Return file, line and function of the innermost frame of this package, as text for a report.
+
+    Of another package if there is none of this one; 'at no known place' without a traceback.
+    """
     frames = traceback.extract_tb(error.__traceback__)
     ours = [frame for frame in frames if PACKAGE in Path(frame.filename).parents]
     if not frames:
@@ -236,12 +251,15 @@ class _Takes(Executor):
     """
 
     def _take_subscription(self, sub: Any) -> Any:
+        """Take a message as rclpy does; None if it cannot be read."""
         return self._taken(super()._take_subscription, sub, sub.topic_name)
 
     def _take_client(self, client: Any) -> Any:
+        """Take an answer as rclpy does; None if it cannot be read."""
         return self._taken(super()._take_client, client, client.srv_name)
 
     def _take_service(self, srv: Any) -> Any:
+        """Take a request as rclpy does; None if it cannot be read."""
         return self._taken(super()._take_service, srv, srv.srv_name)
 
     def _taken(self, take: Callable[[Any], Any], entity: Any, name: str) -> Any:
@@ -277,9 +295,10 @@ def run(
 ) -> int:
     """Spin the node that `make_node` returns until a signal, its failure or its finish.
 
-    ``threads``: more than one lets a callback block (a service that measures) while others run.
-    Returns the exit status, see `report`; 0 after SIGINT or SIGTERM. An error is one line on
-    stderr.
+    ``args``: command line, None for that of the process; ``threads``: more than one lets a
+    callback block (a service that measures) while others run. The node is closed and destroyed at
+    the end. Returns the exit status, see `report`; 0 after SIGINT or SIGTERM, or if finished. An
+    error is one line on stderr.
     """
     stopping: list[int] = []
 
@@ -324,7 +343,11 @@ def run(
 
 
 def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:
-    """Execute the callbacks that are due; an uncaught exception goes to the node's `on_fault`."""
+    """Execute the callbacks that are due; an uncaught exception goes to the node's `on_fault`.
+
+    A RemasterError becomes the node's `failure` unless the node outlives faults. Returns after
+    `timeout_s` at most if none is due. Raises ExternalShutdownException as rclpy.
+    """
     try:
         executor.spin_once(timeout_sec=timeout_s)
     except ExternalShutdownException:

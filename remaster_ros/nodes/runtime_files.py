@@ -70,7 +70,10 @@ class NameLock:
         os.pwrite(self._file, f'{os.getpid()}\n'.encode(), 0)
 
     def _lock(self, domain: int, name: str, patience_s: float) -> None:
-        """Lock the file, waiting up to `patience_s`; InputError if another process holds it."""
+        """Lock the file, waiting up to `patience_s`; InputError if another process holds it.
+
+        The error has that process's id, if the file has it.
+        """
         deadline = time.monotonic() + patience_s
         while True:
             try:
@@ -107,14 +110,15 @@ def page_name(domain: int, node: str) -> str:
 
 
 def opening_path(name: str) -> Path:
-    """Return the file that leads to the page of this name."""
+    """Return the file that leads to the page `name`. Raises as `runtime_folder`."""
     return runtime_folder() / f'{name}.html'
 
 
 def opening_file(name: str, url: str) -> Path:
-    """Write a page that leads to the address with the token, which only this user can read.
+    """Write a page that leads to the address with the token; return its path.
 
-    Output of a launch is kept in log files, where others may find it; a path is no secret.
+    ``name``: of `page_name`. Only this user can read it, and an earlier one is replaced. Output of
+    a launch is kept in log files, where others may find it; a path is no secret.
     """
     path = opening_path(name)
     path.unlink(missing_ok=True)

@@ -57,7 +57,11 @@ class RvizMarkers:
         return marker
 
     def _marker(self, space: str, number: int, kind: int, color: str, size: float) -> Marker:
-        """Marker in the base frame at the origin; `size`: scale along all axes, m."""
+        """Marker in the base frame at the origin, of one `kind` of visualization_msgs/Marker.
+
+        ``space, number``: namespace and id; ``color``: ``#rrggbb``; ``size``: scale along all
+        axes, m.
+        """
         marker = Marker(ns=space, id=number, type=kind, action=Marker.ADD)
         marker.header.frame_id = self._base
         marker.pose.orientation.w = 1.0
@@ -71,7 +75,11 @@ class RvizMarkers:
         return bool(self._publisher.get_subscription_count())
 
     def publish(self, scene: Mapping[str, Any]) -> None:
-        """Publish the markers of a `LiveView.view(…)['scene']`."""
+        """Publish the markers of a `LiveView.view(…)['scene']`, with one stamp of now.
+
+        Without positions of the arm, and without a target, these are left out; empty lists are
+        deleted.
+        """
         markers = []
         if scene['q'] is not None:
             frames = self._scene.transforms(np.array(scene['q']))
@@ -97,7 +105,7 @@ class RvizMarkers:
         self._publisher.publish(MarkerArray(markers=markers))
 
     def _axes(self, T: FloatArray) -> list[Marker]:
-        """Arrow markers of the axes of a pose T, (4, 4): x red, y green, z blue."""
+        """Arrow markers of the axes of a pose T, (4, 4): x red, y green, z blue, 0.12 m long."""
         markers = []
         for axis, color in enumerate(('#d62728', '#2ca02c', '#1f77b4')):
             arrow = self._marker('target', axis, Marker.ARROW, color, 0.012)
@@ -109,8 +117,9 @@ class RvizMarkers:
     def place_sensors(self, T_R_N: Mapping[str, FloatArray]) -> None:
         """Publish where sensors stand, sensor -> (4, 4), to /tf_static.
 
-        The registration of a sensor on the tool is the frame of the board that it sees, and is
-        called so, as in the transforms that `remaster export --to tf` writes.
+        Nothing without tf2_msgs or `publish_tf`. The registration of a sensor on the tool is the
+        frame of the board that it sees, and is called so, as in the transforms that `remaster
+        export --to tf` writes.
         """
         if self._tf is None:
             return
@@ -125,8 +134,10 @@ class RvizMarkers:
 
 
 def _color(red: float, green: float, blue: float) -> ColorRGBA:
+    """Return an opaque color; parts 0 to 1."""
     return ColorRGBA(r=float(red), g=float(green), b=float(blue), a=1.0)
 
 
 def _points(points: FloatArray) -> list[Point]:
+    """Return points (n, 3), m, as messages."""
     return [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]

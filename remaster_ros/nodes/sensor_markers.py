@@ -114,10 +114,11 @@ class MeasureService:
         )
 
     def _on_pose(self, message: PoseStamped) -> None:
+        """Keep the tool's target pose, T_R_T (4, 4). Raises InputError as `read_place`."""
         self._T_R_T = read_place(message.pose.position, message.pose.orientation)
 
     def _on_joints(self, message: JointState) -> None:
-        """Keep the tool's pose of a finite joint state; ignore an invalid joint state."""
+        """Keep the tool's pose by a joint state; ignore an invalid or non-finite one."""
         # What is wrong with joint states, the bridge reports.
         with contextlib.suppress(InputError):
             q = self._joint_order.positions(message)
@@ -130,7 +131,7 @@ class MeasureService:
             self._T_N_R = transforms.inverse(transform_array(message))
 
     def _on_trajectory(self, message: JointTrajectory) -> None:
-        """Note when a commanded trajectory arrives, s; ignore one of a single point, a stop."""
+        """Note when a commanded trajectory ends, s, for `step`; ignore one of a single point."""
         # One point alone is a stop on the way, where nothing is to be found.
         if len(message.points) > 1:
             self._arrival_s = self._node.now_s() + seconds(message.points[-1].time_from_start)
@@ -139,14 +140,19 @@ class MeasureService:
     def _expected(self, marker: str = '') -> FloatArray | None:
         """Expected position of a marker in the sensor's frame, m, (3,).
 
-        None before registration, or before the first joint states.
+        ``marker``: '' for the sensor's first. None before registration, or before the first pose
+        (with several markers: joint states).
         """
         if self._T_N_R is None or self._T_R_T is None:
             return None
         return transforms.apply(self._T_N_R @ self._T_R_T, self._markers_T[marker])
 
     def step(self) -> None:
-        """Wait half a second for a command of the arm; prepare the driver when it has arrived."""
+        """Wait half a second for a command of the arm; prepare the driver when it has arrived.
+
+        Returns None: at once without a command, or if the node ends. A DeviceError becomes the
+        node's trouble.
+        """
         if not self._commanded.wait(0.5):
             return
         self._commanded.clear()
@@ -161,7 +167,11 @@ class MeasureService:
                 self._node.trouble = str(error)
 
     def _on_measure(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Measure each marker once; the points are published before the answer goes out."""
+        """Serve a request: measure each marker once; its point is published before the answer.
+
+        It succeeds if any marker was measured and the device is still connected; those that were
+        not are published as NaN. Else the response has the reason, as the node's `trouble` has.
+        """
         node = self._node
         if node.clock_trouble:
             response.message = node.clock_trouble
@@ -202,7 +212,10 @@ class MeasureService:
         return [self._last, *(name for name in self._markers_T if name != self._last)]
 
     def _measure(self, marker: str) -> float:
-        """Measure a marker once, publish the reading and its temperature; return its stamp, s."""
+        """Measure a marker once, publish the reading and its temperature; return its stamp, s.
+
+        ``marker``: '' for the sensor's first. Raises DeviceError if there is no measurement.
+        """
         expected = self._expected(marker)
         if len(self._markers_T) > 1 and expected is not None:
             self._driver.turn_to(marker, expected)
@@ -227,7 +240,10 @@ ANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> None:
-    """Hand all messages of a source to its driver; `InputError` for a type not installed."""
+    """Hand all messages of a sensor's source to its driver.
+
+    Raises InputError if the message type is not installed.
+    """
     try:
         kind = message_class(sensor.message_type)
     except InputError:
@@ -334,13 +350,19 @@ class SensorNode(RemasterNode):
         self._thread.start()
 
     def _sleep(self, duration_s: float) -> None:
-        """Wait on the node's clock, which may be simulated and may stand still."""
+        """Wait on the node's clock, which may be simulated and may stand still.
+
+        It waits as long as the clock stands, and returns early only if the node ends.
+        """
         until = self.now_s() + duration_s
         while self.now_s() < until and not self._ending.wait(0.002):
             pass
 
     def _work(self) -> None:
-        """Keep the device open and serve it; the body of the thread."""
+        """Thread: keep the device open and serve it until the node ends.
+
+        An unforeseen exception becomes the node's `failure`.
+        """
         try:
             while not (self._ending.is_set() or self.failure):
                 came_s = None
@@ -354,7 +376,10 @@ class SensorNode(RemasterNode):
                 self.failure = fault_of_this_program(error)
 
     def _open(self) -> None:
-        """Try to open the device; the first time until the start time-out."""
+        """Try to open the device once; if that fails, keep why, and wait `RETRY_S`.
+
+        Before the device has worked, a failure after the start time-out ends the node.
+        """
         with self.in_use:
             self.driver.phase = 'connecting'
             try:
@@ -371,13 +396,19 @@ class SensorNode(RemasterNode):
             self._ending.wait(RETRY_S)
 
     def _require_start(self, error: RemasterError) -> None:
-        """End the node with this error if the device has not worked within the time to start."""
+        """End the node with this error if the device has not worked within the start time-out.
+
+        Nothing once it has.
+        """
         over = time.monotonic() > self._start_by
         if over and not (self._started or self._ending.is_set()):
             self.failure = error
 
     def _read(self, driver: StreamDriver) -> float | None:
-        """Publish the next reading of a stream; return its time, s, or None if there is none."""
+        """Publish the next reading of a stream; return when it was received, s, None without one.
+
+        A DeviceError closes the driver, which is opened again after `RETRY_S`.
+        """
         try:
             reading = driver.read()
         except DeviceError as error:
@@ -395,7 +426,11 @@ class SensorNode(RemasterNode):
         return None
 
     def publish_reading(self, reading: MarkerReading) -> None:
-        """Publish a measured position under its time of capture."""
+        """Publish a measured position, m, and the pose, if any, with its time of capture.
+
+        A missing orientation is NaN in the pose. Of a sensor on the tool the point is the camera's
+        in the board's frame.
+        """
         message = PointStamped()
         message.header.stamp = stamp_of(reading.stamp_s)
         message.header.frame_id = self.sensor
@@ -416,7 +451,10 @@ class SensorNode(RemasterNode):
         self.published += reading.seen
 
     def _summary(self) -> Summary:
-        """Summary for the status: readiness, and the trouble of node, clock or driver."""
+        """Summary for the status: readiness, and the trouble of clock, node or driver.
+
+        Trouble of the clock counts before the node's, the node's before the driver's.
+        """
         state = self.driver.state()
         open_now = self.driver.phase == 'ready' and self.driver.connected
         trouble, level = state.trouble, state.level
@@ -436,14 +474,18 @@ class SensorNode(RemasterNode):
         return Summary(level, report.message, values, report)
 
     def close(self) -> None:
-        """Disconnect from the device."""
+        """Disconnect from the device, and wait for the thread, 2 s at most."""
         self._ending.set()
         self.driver.close()
         self._thread.join(2.0)
 
 
 def run_sensor(name: str, args: list[str] | None = None, threads: int = 3) -> int:
-    """Run the node of a sensor; parameters as of `SensorNode` and `run`."""
+    """Run the node of a sensor until it ends; return its exit status, see `running.run`.
+
+    ``name``: of the node, which chooses the driver unless one is given in `args`; ``threads``: of
+    its executor.
+    """
     return run(lambda: SensorNode(name), args, threads=threads)
 
 

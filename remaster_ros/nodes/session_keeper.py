@@ -46,7 +46,10 @@ class SessionKeeper:
         return self.full if self._moved or not self.full else f'room on the disk: {self.full}'
 
     def write(self, write: Callable[[], object]) -> None:
-        """Call `write`; if the disk is full, `look` repeats it."""
+        """Call `write` now; if it raises DiskError, `full` says why, and `look` repeats it.
+
+        One write waits at most, and a new one takes its place. Other errors are raised.
+        """
         self._waiting, self._tried_wall = None, time.monotonic()
         try:
             write()
@@ -61,7 +64,8 @@ class SessionKeeper:
     def look(self) -> bool:
         """Retry a failed write and repair files that others changed; whether one was repaired.
 
-        Writes are repeated every `RETRY_S`, files checked every `CHECK_S`; False in between.
+        Writes are repeated every `RETRY_S`, files checked every `CHECK_S`; False in between. To be
+        called often, by a timer.
         """
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:
@@ -74,7 +78,10 @@ class SessionKeeper:
         return self._report_restored()
 
     def _report_restored(self) -> bool:
-        """Log repairs; return whether there were any."""
+        """Log repairs of the session's files since the last call; return whether there were any.
+
+        The last one is kept in `restored`.
+        """
         lines = self.journal.take_restored()
         for line in lines:
             self._node.get_logger().error(line)
@@ -82,12 +89,19 @@ class SessionKeeper:
         return bool(lines)
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Reopen a stopped session; with `go_further`, a complete one."""
+        """Reopen a stopped session and its bag; with `go_further`, also a complete one.
+
+        Without it a complete session stays closed. Raises InputError as `SessionWriter` and
+        `BagRecorder.reopen`.
+        """
         self.journal.reopen(go_further=go_further)
         self.bag.reopen()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close session and bag; raise DiskError if the session remains open."""
+        """Close session and bag with an exit status; log an error if it becomes another one.
+
+        Raises DiskError if the session remains open: then the bag does too.
+        """
         self.journal.close(exit_status)
         self._report_restored()
         if self.journal.closed != exit_status:

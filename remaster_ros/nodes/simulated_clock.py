@@ -68,6 +68,7 @@ class SteadyTime:
             node.create_subscription(Clock, '/clock', self._on_clock, CLOCK_QOS, raw=True)
 
     def _on_clock(self, message: bytes) -> None:
+        """Note when the simulated clock came."""
         self._heard_wall = time.monotonic()
 
     def __call__(self) -> float:
@@ -109,7 +110,12 @@ class ReportsTaken:
         self._confirmed_wall = 0.0
 
     def take(self, stamp: Time) -> None:
-        """Process that all was taken: up to the report with this stamp, or until this time."""
+        """Confirm that all was taken: up to the report with this stamp, or until this time.
+
+        Publishes `TAKEN` at most every `TAKEN_EVERY_S` of stamps, for who leads the arm at every
+        new stamp; a stamp that stands is confirmed again after that in wall time. Nothing without
+        a simulation.
+        """
         if self._publisher is None:
             return
         stamp_s, wall = seconds(stamp), time.monotonic()

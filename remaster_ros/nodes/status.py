@@ -51,6 +51,7 @@ def node_of(info: TopicEndpointInfo) -> str:
 def mismatch(offered: QoSProfile, wanted: QoSProfile) -> str:
     """Return why a subscriber gets no messages of a publisher by their QoS; '' if it does.
 
+    ``offered``: the publisher's; ``wanted``: the subscriber's; reliability and durability count.
     Leases and deadlines are not looked at: `nodes.rivals` requires a lease that foreign publishers
     do not offer, in order to leave them out.
     """
@@ -177,14 +178,22 @@ class NodeStatus:
         return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
-        """Whether this node has listened for 1.5 s and found no other of its name."""
+        """Whether this node has listened for 1.5 s and found no other of its name.
+
+        ``now``: `time.monotonic`, s.
+        """
         return self._duplicates.alone(now)
 
     def _look_at_qos(self) -> None:
+        """Keep which topics lose messages by QoS (`mismatches`)."""
         self._qos_trouble = mismatches(self._node)
 
     def _on_record(self, record: EventRecord) -> None:
-        """Set the node's failure if another process with its name has run for longer."""
+        """Set the node's failure if another process with its name has run for longer.
+
+        Only states of the same full name count, and only while the graph has two publishers of
+        that name.
+        """
         own = self._node.get_fully_qualified_name()
         if record.node != own or not record.started or not isinstance(record.body, STATES):
             return
@@ -233,11 +242,16 @@ class NodeStatus:
         self._events.publish(String(data=encode(record)))
 
     def _publish_diagnostics(self) -> None:
+        """Publish the summary on /diagnostics."""
         with self._order:
             self._publish_status(self._diagnostics, self._summary())
 
     def _publish_status(self, publisher: Any, summary: Summary) -> None:
-        """Publish a summary as diagnostics; 'ok' becomes 'warn' if there is QoS trouble."""
+        """Publish a summary as diagnostics; 'ok' becomes 'warn' if there is QoS trouble.
+
+        ``publisher``: of remaster/status or of diagnostics, which name status and hardware
+        differently.
+        """
         level, message = summary.level, summary.message
         if self._qos_trouble and level == 'ok':
             level, message = 'warn', self._qos_trouble
@@ -266,7 +280,10 @@ class NodeStatus:
 
 
 def pairs(state: State) -> dict[str, str]:
-    """Return the fields of a state as text for people, one pair for each entry of a table."""
+    """Return the fields of a state as text for people, name -> text.
+
+    A table becomes one pair ``NAME_KEY`` for each of its entries; nested structures are left out.
+    """
     found = {}
     for name, value in msgspec.structs.asdict(state).items():
         if isinstance(value, dict):
@@ -284,7 +301,7 @@ def _text(value: Any) -> str:
 
 
 def taken_key(record: EventRecord) -> str:
-    """Return the key by which a recorder counts the records of a node's start."""
+    """Return the key by which a recorder counts the records of a node's start: 'NODE STARTED'."""
     return f'{record.node} {record.started}'
 
 
@@ -316,8 +333,8 @@ def listen(
 ) -> None:
     """Subscribe to the records of all nodes, to their diagnostics, or to both.
 
-    ``on_summary``: called with (node, message, values) of every status; for programs that show
-    them.
+    ``on_record``: called with every valid record, see `receiver`; ``on_summary``: called with
+    (node, message, values) of every status; for programs that show them.
     """
     if on_record is not None:
         node.create_subscription(String, EVENTS, receiver(node, on_record), RELIABLE)

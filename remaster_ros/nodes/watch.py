@@ -126,7 +126,11 @@ class Watch(RemasterNode):
         self.create_timer(EVERY_S, self._show, clock=self.status.steady)
 
     def _open_page(self, scene: bytes) -> LiveServer:
-        """Start the server of the live page, and print its address for this user alone."""
+        """Start the server of the live page, and print its address for this user alone.
+
+        On a terminal the address with the token, else the path of a file that leads there. Raises
+        InputError as `LiveServer` and `runtime_folder`.
+        """
         names = tuple(name.strip() for name in self.p.names.split(',') if name.strip())
         place = Place(self.p.address, self.p.port, names, self.p.certificate, self.p.key)
         name = page_name(self.context.get_domain_id(), self.get_fully_qualified_name())
@@ -138,7 +142,10 @@ class Watch(RemasterNode):
         return page
 
     def _subscribe(self, sensors: Mapping[str, Mapping[str, str]]) -> None:
-        """Subscribe to all topics that the page shows, and the markers of `sensors`."""
+        """Subscribe to all topics that the page shows, and the markers of `sensors`.
+
+        ``sensors``: sensor -> marker -> topic. Invalid messages are dropped silently.
+        """
 
         def take(kind: type, topic: str, callback: Callable[[Any], None], qos: QoSProfile) -> None:
             self.create_subscription(kind, topic, _tolerant(callback), qos)
@@ -165,10 +172,11 @@ class Watch(RemasterNode):
     # What comes in
 
     def _on_record(self, record: EventRecord) -> None:
+        """Show a record of another node."""
         self.view.take(record.body, time.monotonic())
 
     def _on_status(self, array: DiagnosticArray) -> None:
-        """Show each diagnostic status; then look for a new plan."""
+        """Show each diagnostic status; then look for a new plan. An unknown level is an error."""
         words = {level: word for word, level in LEVELS.items()}
         for status in array.status:
             values = {pair.key: pair.value for pair in status.values}
@@ -178,7 +186,11 @@ class Watch(RemasterNode):
         self._look_for_plan()
 
     def _look_for_plan(self) -> None:
-        """Read the page of the next plan, and make a client of its confirmation service."""
+        """Read the page of the next plan, and make a client of its confirmation service.
+
+        The client of the plan before is destroyed; nothing if the plan is the same. The page is
+        read in the background.
+        """
         plan, page = self.view.plan_to_show()
         if plan == self._plan:
             return
@@ -191,7 +203,7 @@ class Watch(RemasterNode):
             self._background.submit(read, partial(self._on_plan_page, plan))
 
     def _on_plan_page(self, plan: str, found: bytes | Exception) -> None:
-        """Show the page of a plan, or the error with which it could not be had."""
+        """Show the page of a plan, or the error with which it could not be read."""
         if isinstance(found, Exception):
             self.view.take_plan_page(PlanPage(plan, trouble=str(found)))
         else:
@@ -204,13 +216,16 @@ class Watch(RemasterNode):
             self.view.take_joints(self._q)
 
     def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
+        """Give a reading, m, to the residuals on the page."""
         position = np.array([message.point.x, message.point.y, message.point.z])
         self.view.residuals.reading(sensor, marker, position)
 
     def _on_target(self, message: PoseStamped) -> None:
+        """Show a target pose."""
         self.view.take_target(read_place(message.pose.position, message.pose.orientation))
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
+        """Keep the waypoints, for the solutions with the same stamp."""
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
@@ -225,19 +240,25 @@ class Watch(RemasterNode):
         self.view.take_way(np.concatenate(way) if way else targets)
 
     def _on_registration(self, message: TransformStamped) -> None:
+        """Show a sensor's registration, on the page and in RViz."""
         self.view.take_registration(message.child_frame_id, transform_array(message))
         self._rviz.place_sensors(self.view.registration)
 
     def _on_means(self, message: JointState) -> None:
+        """Keep the offsets of a fit; show them once their deviations are there."""
         self._means = message
         self._take_offsets()
 
     def _on_stds(self, message: JointState) -> None:
+        """Keep the deviations of the offsets; show both once the offsets are there."""
         self._stds = message
         self._take_offsets()
 
     def _take_offsets(self) -> None:
-        """Take the offsets of a fit when both of its messages are there."""
+        """Show the offsets of a fit when both of its messages (same stamp) are there.
+
+        Further figures are read from its fit.json, in the background.
+        """
         means, stds = self._means, self._stds
         if means is None or means.header.stamp != stds.header.stamp:
             return
@@ -248,16 +269,22 @@ class Watch(RemasterNode):
         )
 
     def _on_fit_facts(self, facts: Any) -> None:
+        """Show figures of a fit, unless reading them has failed."""
         if not isinstance(facts, Exception):
             self.view.take_fit(facts)
 
     # What goes out
 
     def _caller(self, name: str) -> Any:
+        """Return a client of the service remaster/`name`."""
         return self.create_client(Trigger, f'remaster/{name}')
 
     def _send(self, name: str, done: Done) -> None:
-        """Call a service; in the thread of the page, whose executor this is not."""
+        """Call a service, and `done` with success and message when it has answered.
+
+        In the thread of the page, whose executor this is not. `done` is called at once, without
+        success, if `name` is no service of the page now, or nobody offers it.
+        """
         client = self._callers.get(name)
         if client is None:
             done(False, OTHER_PLAN)
@@ -280,7 +307,7 @@ class Watch(RemasterNode):
             done(False, OTHER_PLAN)
 
     def _show(self) -> None:
-        """Publish the view to page and RViz; less often if nobody looks."""
+        """Publish the view to page and RViz every `EVERY_S`; `IDLE_EVERY_S` if nobody looks."""
         now = time.monotonic()
         confirming = self._callers.get(f'{CONFIRM}/{self._plan}')
         self.view.plan_offered = confirming is not None and confirming.service_is_ready()
@@ -293,11 +320,12 @@ class Watch(RemasterNode):
                 self._rviz.publish(view['scene'])
 
     def _summary(self) -> Summary:
+        """Summary for the status: whether somebody looks at the page, and where it is served."""
         state = 'watched' if self.page.watched else 'serving'
         return Summary('ok', state, {'address': self.p.address, 'port': self.page.port})
 
     def close(self) -> None:
-        """End the server."""
+        """End the server and the background thread."""
         self.page.close()
         self._background.close(1.0)
 
@@ -316,7 +344,8 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
     """Return figures of a fit.json for the page, besides offsets; empty if there is none.
 
     ``folder``: of the optimizer, if it is on this computer; ``offsets``: as published, joint ->
-    rad or m; a file of another fit counts as none.
+    rad or m; a file of another fit (an offset differs, `numpy.isclose`) counts as none, as does an
+    invalid one.
     """
     try:
         fit = read_fit(folder / FIT_FILE)

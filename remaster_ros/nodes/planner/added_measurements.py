@@ -64,18 +64,24 @@ class AddedMeasurements:
         return '', partial(self._plan, causes, most)
 
     def _digest(self) -> str:
-        """Return the SHA-256 of the session's table of observations."""
+        """Return the SHA-256 of the session's table of observations, as hexadecimal text.
+
+        Raises InputError if the table is missing or too large.
+        """
         rows = read_limited(self._session / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
         return hashlib.sha256(rows).hexdigest()
 
     def _added_so_far(self) -> int:
-        """Return the number of configurations added so far."""
+        """Return the number of configurations that the tours of additions so far have to fit."""
         return sum(tour.to_fit for tour in self._journal.tours if tour.begin_at)
 
     def _plan(
         self, causes: tuple[FoundCause, ...], most: int, T_R_N: Mapping[str, FloatArray]
     ) -> Tour:
-        """Return the tour of the additions."""
+        """Return the tour that separates `causes`, of at most `most` configurations.
+
+        ``T_R_N``: registrations, sensor -> (4, 4). Raises as `TourPlanner.separating_tour`.
+        """
         previous = self._journal.tour
         assert previous is not None
         rows = read_session(self._session).measurements
@@ -90,7 +96,7 @@ class AddedMeasurements:
         return '; '.join(filter(None, (tour.describe(), expected)))
 
     def describe(self) -> str:
-        """Return the separations by the additions in one line; '' before they are planned."""
+        """Return how far the additions separate causes from look-alikes; '' if unplanned."""
         design = self._tours.separating_design
         if design is None:
             return ''

@@ -88,7 +88,12 @@ class Inspections:
         return session.with_name(f'{session.name}.check.html')
 
     def refusal(self, kind: Inspection, bridge: BridgeState | None) -> str:
-        """Return why an inspection cannot begin; '' if it can."""
+        """Return why an inspection cannot begin, with the remedy; '' if it can.
+
+        ``bridge``: its last state, None if none has come. Reasons: no or an invalid
+        compensation.json, no bridge; for verify also a joint that slides, or another file in the
+        bridge (by its SHA-256).
+        """
         # Imported when needed, since the import is slow.
         from remaster_ros.compensation.file import read_compensation
 
@@ -148,7 +153,11 @@ class Inspections:
         )
 
     def evaluate(self, kind: Inspection) -> None:
-        """Start the evaluation of the session that the recorder has closed, once."""
+        """Start the evaluation of the session that the recorder has closed, at most once.
+
+        Returns at once; the verdict is in `verdict` and on `VERDICT`, or `trouble` says why there
+        is none.
+        """
         if not self._evaluating:
             self._evaluating = True
             command = [kind, str(self._session), '--json']
@@ -160,7 +169,10 @@ class Inspections:
             self._background.submit(lambda: _output_of_verb(command), self._on_answer)
 
     def _on_answer(self, answer: str | Exception) -> None:
-        """Publish the verdict, or log why there is none."""
+        """Publish the verdict and log it with its warnings; log and keep why there is none.
+
+        ``answer``: JSON of the verb, or the exception.
+        """
         if isinstance(answer, Exception):
             self.trouble = f'not judged: {answer}'
             self._log.error(self.trouble)
@@ -173,7 +185,7 @@ class Inspections:
         self._publisher.publish(String(data=answer))
 
     def answer(self) -> tuple[bool, str]:
-        """Return whether there is a verdict, and the verdict or why there is none."""
+        """Return whether there is a verdict, and the verdict, or why there is none (yet)."""
         return bool(self.verdict), self.verdict or self.trouble or 'it is being judged'
 
     def close(self) -> None:
@@ -182,7 +194,11 @@ class Inspections:
 
 
 def _output_of_verb(command: list[str]) -> str:
-    """Return the output of a verb of the command line; raise InputError with its error line."""
+    """Return the output of a verb of the command line, without white space around it.
+
+    ``command``: verb and arguments. Raises InputError with the last line of its stderr if its exit
+    status is not 0, `subprocess.TimeoutExpired` after `LONGEST_WALL_S`.
+    """
     done = subprocess.run(
         [sys.executable, '-m', 'remaster_ros.cli.main', *command],
         capture_output=True,

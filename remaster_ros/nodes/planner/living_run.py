@@ -31,7 +31,7 @@ def since_boot_s() -> float:
 
 
 def new_token() -> str:
-    """Return a random token for a new run."""
+    """Return a random token for a new run: 12 hexadecimal digits."""
     return uuid.uuid4().hex[:12]
 
 
@@ -44,7 +44,10 @@ class LivingRun:
         self.stay_alive()
 
     def stay_alive(self) -> None:
-        """Renew the liveness file, at most once a second; if that fails, no planner resumes."""
+        """Renew the liveness file, at most every `ALIVE_S`; if that fails, no planner resumes.
+
+        Nothing is raised then.
+        """
         now = since_boot_s()
         if now - self._renewed < ALIVE_S:
             return
@@ -65,7 +68,7 @@ class LivingRun:
 def silence_s(token: str) -> float | None:
     """Return the time since the planner of a run last renewed its liveness file, s.
 
-    None if it did not in this boot of this computer, or the run was ended.
+    None if it did not in this boot of this computer, the run was ended, or `token` is no token.
     """
     if not token.isalnum():
         return None
@@ -78,5 +81,5 @@ def silence_s(token: str) -> float | None:
 
 
 def _path(token: str) -> Path:
-    """Return the path of the liveness file of a run."""
+    """Return the path of the liveness file of a run. Raises InputError as `runtime_folder`."""
     return runtime_folder() / f'run_{token}'

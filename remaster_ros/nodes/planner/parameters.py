@@ -92,7 +92,7 @@ class Parameters(InspectionParameters):
     def tour_planner(
         self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
     ) -> TourPlanner:
-        """Return the planner of the tours of a cell; ``causes``: from `causes`."""
+        """Return the planner of the tours of a cell; ``causes``: to be separated."""
         scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
         counts = {
             'optimization': self.optimization_candidates,
@@ -121,7 +121,10 @@ class Parameters(InspectionParameters):
         return read_causes(self.separate, joint_names)
 
     def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
-        """Return everything that the plan depends on, as plain data by name."""
+        """Return everything that the plan depends on, as plain data by name.
+
+        Another plan has other settings; speeds are left out if the plan does not depend on them.
+        """
         design = cell.design_settings()
         speeds = {
             'speed_share': self.speed_share,

@@ -48,7 +48,10 @@ class PlanPreview(PlanConfirmation):
         self._drawn_id = None
 
     def values(self) -> dict[str, str]:
-        """Return the values for the status: page, plan shown, confirmed."""
+        """Return the values for the status: page, plan shown, confirmed (yes or no).
+
+        {} if no confirmation is required.
+        """
         if not self.required:
             return {}
         done = self.shown and self.shown == self.confirmed
@@ -66,8 +69,9 @@ class PlanPreview(PlanConfirmation):
     def draw(self, q: FloatArray, peers: Peers) -> str:
         """Draw the next plan if the page shows another one; return a message for the user.
 
-        '' while it is drawn, and if nothing has changed. ``q``: the arm's configuration, rad,
-        (k,); ``peers``: tell which sensors must be registered before the collection.
+        '' while it is drawn, if nothing has changed, if no confirmation is required, and if it
+        cannot be planned, when `trouble` says why. ``q``: the arm's configuration, rad or m, (k,);
+        ``peers``: tell which sensors must be registered before the collection.
         """
         if not self.required:
             return ''
@@ -102,7 +106,9 @@ class PlanPreview(PlanConfirmation):
     def _next(self, required: RequiredSensors) -> tuple[str, Tour | None]:
         """Return identifier and tour of the next plan; the tour is None if it is not planned yet.
 
-        The next plan is the one that `TourProgress.next` would visit.
+        The next plan is the one that `TourProgress.next` would visit. The identifier is the tour's
+        fingerprint, or `REGISTRATION`, or ``collection`` with a hash of the registrations.
+        ``required``: sensors that must be registered before the collection.
         """
         T_R_N, tour = self._progress.T_R_N, self._memory.tour
         registered = self._progress.phase != REGISTRATION or required.are_among(T_R_N)
@@ -121,7 +127,12 @@ class PlanPreview(PlanConfirmation):
         T_R_N: dict[str, FloatArray],
         q: FloatArray,
     ) -> str:
-        """Write the page of `tour`, planned here if None; return the fingerprint of the tour."""
+        """Write the page of `tour`, planned here if None; return the fingerprint of the tour.
+
+        In the background thread. ``visit``: the open one, at which a tour goes on; ``T_R_N``:
+        registrations, sensor -> (4, 4); before them the sensors' rough places are shown; ``q``:
+        where the arm is. Raises RemasterError if it cannot be planned or written.
+        """
         # Imported when needed: most planners draw no page.
         from remaster_ros.reports.plan_page import plan_page, write_plan_page
         from remaster_ros.reports.robot_scene import robot_scene

@@ -42,13 +42,13 @@ class PosePublisher:
 
     @property
     def subscribers(self) -> int:
-        """Number of nodes that subscribe to the solutions, viewers excluded."""
+        """Number of the nodes in `PEERS` that subscribe to the solutions; viewers excluded."""
         subscriptions = self._node.get_subscriptions_info_by_topic(self._solutions.topic_name)
         viewers = sum(info.node_name not in PEERS for info in subscriptions)
         return int(self._solutions.get_subscription_count()) - viewers
 
     def stop(self) -> None:
-        """Publish an empty message, at which the bridge stops the arm."""
+        """Publish solutions without a point, at which the bridge stops the arm."""
         self._solutions.publish(JointTrajectory(joint_names=list(self._chain.joint_names)))
 
     def announce(self, visit: PoseVisit, plan: str, status: NodeStatus, *, last: bool) -> str:
@@ -92,7 +92,7 @@ class PosePublisher:
         return key
 
     def repeat(self, status: NodeStatus) -> None:
-        """Publish the last announcement again, unchanged."""
+        """Publish the last announcement again, unchanged, event first; there must be one."""
         assert self._event is not None
         # The event first: the recorder needs the pose before the arm arrives.
         status.event(self._event)

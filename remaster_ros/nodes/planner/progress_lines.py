@@ -32,7 +32,11 @@ class ProgressLines:
         node.create_timer(LOOK_S, self._look, clock=clock)
 
     def _look(self) -> None:
-        """Log a line if the progress has changed and the interval has passed."""
+        """Log a line if the progress has changed, while running at most every `EVERY_S`.
+
+        Timer callback. A change of the state is logged at once; nothing before a collection is
+        planned.
+        """
         now, counts, state = time.monotonic(), self._counts(), self._state()
         done, of = counts['configurations_done'], counts['configurations']
         self._pace.update(done, now, running=state == 'running')
