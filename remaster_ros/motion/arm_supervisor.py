@@ -132,10 +132,10 @@ class ArmSupervisor:
     # What comes in
 
     def planner_is(self, state: str, wall_s: float, run: str = '') -> list[Action]:
-        """Process the planner's state; anything but ``running`` stops the arm.
+        """Process the planner's state at `wall_s`, s; anything but ``running`` stops the arm.
 
-        ``run`` identifies the run of a collection: a new one shows that a person has called
-        /remaster/collect.
+        ``run`` identifies the run of a collection, '' if none: a new one shows that a person has
+        called /remaster/collect, and clears the counts of failures in a row.
         """
         if self._interlocks.planner(state, run, wall_s):
             self._failures = self._refusals = self._missed_in_a_row = 0
@@ -144,7 +144,11 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
-        """Process a sign of life of the recorder; '' if no required sensor is missing."""
+        """Process a sign of life of the recorder at `wall_s`, s, which may wait on purpose.
+
+        ``waiting_for``: what it waits for, which stops the arm; '' if no required sensor is
+        missing.
+        """
         why = f'waiting for {waiting_for}' if waiting_for else ''
         self._interlocks.note_alive('recorder', why, wall_s)
         return self.tick(wall_s)
@@ -156,10 +160,10 @@ class ArmSupervisor:
         waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
         refused: Mapping[int, str] = NO_REFUSALS,
     ) -> list[Action]:
-        """Begin to visit the solutions of a pose, rad or m, (m, k), in this order; none: stop.
+        """Begin to visit the solutions of a pose, rad or m, (m, k), in this order; m = 0: stop.
 
-        ``waypoints`` has configurations on the way to a solution, (n, k), by its number;
-        ``refused`` why one of them must not be commanded.
+        A move under way is stopped first. ``waypoints`` has configurations on the way to a
+        solution, (n, k), by its number, from 0; ``refused`` why one of them must not be commanded.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
         actions += self._step(Event.NEW_POSE)
@@ -180,7 +184,7 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
-        """Process the state of the robot's own safety circuit."""
+        """Process whether the robot's own safety circuit stops the arm; if so, halt."""
         self._interlocks.set('safety', 'the robot reports an emergency stop' if stopped else '')
         return self.tick(wall_s)
 
@@ -198,7 +202,11 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def report(self, report: JointReport) -> list[Action]:
-        """Process a report of the joints."""
+        """Process a report of the joints; return actions, those of `tick` included.
+
+        A report that is not believed goes to `doubt`. After a gap of more than `rules.heartbeat_s`
+        a collection is halted; else the motion under way is judged by it.
+        """
         wall_s = report.wall_s
         if not self.reports.believes(report):
             jumped = self._seen is not None and self.reports.kind in ('too_fast', 'outside_limits')
@@ -218,15 +226,16 @@ class ArmSupervisor:
     def other_joints(self, why: str, wall_s: float) -> None:
         """Process a message on joint_states that has none of the arm's joints: a gripper's, say.
 
-        ``why`` is for whom no other comes.
+        ``why``: text of `trouble` while the arm's own reports are silent and such messages come.
         """
         self._others, self._others_wall = why, wall_s
 
     def doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Process a report that is not believed or not readable; if that lasts, halt a collection.
 
-        ``jumped`` says that the arm was reported at a place that it cannot have reached: that
-        halts even without a collection.
+        It lasts if for more than `DOUBT_S` none was believed. ``jumped`` says that the arm was
+        reported at a place that it cannot have reached: that halts even without a collection.
+        Else, unless paused, what is usual in the reports is learned anew.
         """
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
@@ -244,7 +253,11 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
-        """Process the answer to the last `CheckPath`; an answer to an earlier one is ignored."""
+        """Process the answer to the last `CheckPath`; an answer to an earlier one is ignored.
+
+        With a path the move begins, unless the arm is blocked or has moved since; without one the
+        configuration is refused, or the arm halted if it stands where it must not.
+        """
         asked, seen = self._queue.asked(number), self._seen
         if self.state is not Arm.ASKS or asked is None:
             return []
@@ -267,9 +280,10 @@ class ArmSupervisor:
     def clear_halt(self) -> str:
         """End the halt, on behalf of a person; return why that is refused, '' if it is not.
 
-        Other reasons not to move remain, and nothing moves before a person begins the collection
-        again. Where the arm is reported elsewhere than the last command led, a person is told so
-        first: the halt is ended by a second call, while it is still reported there.
+        Refused during an emergency stop, and without a halt. Other reasons not to move remain, and
+        nothing moves before a person begins the collection again. If the arm is reported elsewhere
+        than the last command led, a person is told so first: the halt is ended by a second call,
+        while it is still reported there.
         """
         if self._interlocks.reason('safety'):
             return self._interlocks.reason('safety')
@@ -307,16 +321,26 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def given_up(self, why: str) -> list[Action]:
-        """Process that the controller refuses the newest command, or does not go on with it."""
+        """Halt, as the controller refuses the newest command, or does not go on with it.
+
+        ``why``: its reason. An arm that is halted already stays so, and is not judged by its stop.
+        """
         # Where a stop was refused the arm is not judged by it any more.
         return self._step(Event.GIVEN_UP) if self.halted else self._halt(why, Event.GIVEN_UP)
 
     def fault(self, why: str, wall_s: float) -> list[Action]:
-        """Process that this program has failed in a step, which may be half done."""
+        """Halt, as this program has failed in a step, which may be half done.
+
+        The arm is stopped first if it is known to follow its path; [] if it is halted already.
+        """
         return [] if self.halted else self._halt_braking(why, wall_s)
 
     def interrupted(self, since_wall_s: float) -> None:
-        """Process the time since which there was no bridge, wall time, s."""
+        """Process that no bridge was there since then, wall time, s.
+
+        Unless that was short (`resume_alone_s`) a person has to go on; see
+        `Interlocks.interrupted`.
+        """
         self._interlocks.interrupted(since_wall_s)
 
     def not_sent(self, command: Drive | Renew | Stop, wall_s: float) -> list[Action]:
@@ -340,7 +364,11 @@ class ArmSupervisor:
         )
 
     def tick(self, wall_s: float) -> list[Action]:
-        """Check the time: stop or halt on silence, go on when nothing is in the way."""
+        """Check the time: stop or halt on silence, go on if nothing is in the way.
+
+        ``wall_s``: now, s. An emergency stop halts, as does a silent robot during a collection;
+        another reason not to move (`blocked`) stops. [] once halted.
+        """
         self._wall = wall_s
         self._interlocks.look(wall_s)
         self._interlocks.look_at_interruption(wall_s)
@@ -393,7 +421,7 @@ class ArmSupervisor:
 
     @property
     def busy(self) -> bool:
-        """Whether a configuration is under way."""
+        """Whether a move is under way, or a settled configuration waits for its answer."""
         return self.state in HAS_VISIT
 
     @property
@@ -427,7 +455,8 @@ class ArmSupervisor:
     def _gap(self, report: JointReport) -> str:
         """Return that a collection's arm was not observed for too long; ''.
 
-        After any gap the arm has as much longer to arrive.
+        Too long is more than `rules.heartbeat_s` of wall time between two stamps. After a gap
+        above `max_gap_s` the arm has as much longer to arrive.
         """
         if self._seen is None:
             return ''
@@ -442,7 +471,11 @@ class ArmSupervisor:
     # Inside: the rest of a move
 
     def _go_on_moving(self, wall_s: float) -> list[Action]:
-        """Actions that send the next piece of a move, if one is due; [] if not."""
+        """Actions that send the next piece of a move, if one is due; [] if not.
+
+        None is sent if the arm is not seen to follow, or the gate refuses it: the present piece
+        ends in a stop. If that stop is about to begin, the move counts as missed.
+        """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
             return []
@@ -470,7 +503,12 @@ class ArmSupervisor:
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
-        """Ask for the way to the next solution of the pose, if the arm stands."""
+        """Actions that lead to the next move, if the arm stands; [] if it does not.
+
+        Before a solution, in this order: halt after `MISSED_IN_A_ROW`, or if the arm is not where
+        it was led; check where it stands; the probe; an allowed way out. Solutions outside the
+        limits are refused, and the way to the next one is asked for.
+        """
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
             return []
@@ -502,7 +540,10 @@ class ArmSupervisor:
         return actions
 
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
-        """Actions that begin a move; none if the arm has moved since its path was checked."""
+        """Actions that begin a move; [] if the arm has moved since its path was checked.
+
+        ``solution``: its index, or `PROBE`, `WAY_OUT`. A move that the gate refuses is given up.
+        """
         # A stamp that is not of the controller's clock would lead the arm to another time.
         self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
         doubtful = None
@@ -553,9 +594,10 @@ class ArmSupervisor:
         return self._fail(visit.solution, why) if outcome == 'failed' and visit is not None else []
 
     def _fail(self, solution: int, reason: str) -> list[Action]:
-        """Actions after a configuration was not reached; halt after too many in a row.
+        """Actions after a configuration was not reached; the queue goes to the next one.
 
-        The arm has settled there or its trajectory has ended, so that no stop is needed.
+        ``solution``: its index. `rules.failures_in_a_row` of them halt; one that has settled, and
+        was not answered in time, does not count. The arm stands, so that no stop is needed.
         """
         if self.state is Arm.MOVES:
             self._failures += 1
@@ -565,6 +607,10 @@ class ArmSupervisor:
         return self._step(Event.FAILED, Failed(solution, reason))
 
     def _halt(self, reason: str, event: Event = Event.HALT) -> list[Action]:
+        """Actions of a halt; the reason of an earlier halt remains.
+
+        No stop is commanded; `event` is looked up in `states.ARM`.
+        """
         # Why it was halted first is what a person has to see to.
         self.halted = self.halted or reason
         return self._step(event, Halted(self.halted))
@@ -581,7 +627,10 @@ class ArmSupervisor:
         return self._halt(reason)
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
-        """Stop an arm that is on its way; the configuration is commanded again later."""
+        """Stop an arm that is on its way; the configuration is commanded again later.
+
+        [] if it is on no way, or ends by itself. It is halted if its place on the path is unknown.
+        """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
             return self._step(Event.STOP)

@@ -71,7 +71,11 @@ class Seen:
     def after(
         cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float
     ) -> Seen:
-        """Follow robot time and standstill; a gap begins the standstill anew."""
+        """Return what is known after a report; ``last``: before it, None for the first.
+
+        Robot time goes on by the stamps. The standstill begins anew after a motion of more than
+        `still_tolerance`, or a gap of more than `max_gap_s`. ``late_s``: of `JointReports.late_s`.
+        """
         q, stamp, wall = report.q, report.stamp_s, report.wall_s
         if last is None:
             return cls(q, stamp, wall, stamp, q, stamp, late_s, np.full(len(q), -np.inf), stamp)
@@ -90,7 +94,7 @@ class Seen:
         return wall_s - self.wall <= FRESH_S
 
     def stands(self, wall_s: float) -> bool:
-        """Whether the arm stands now."""
+        """Whether the arm has stood for `STANDING_S`, and the report is fresh (`is_fresh`)."""
         return self.time - self.stands_since >= STANDING_S and self.is_fresh(wall_s)
 
     def frozen(self) -> BoolArray:
@@ -129,12 +133,16 @@ class Following:
         return time - self.sent
 
     def set_back(self, by_s: float) -> None:
-        """Process that the next line begins later by `by_s`, s; the arm stands before it."""
+        """Begin all that follows later by `by_s`, s, as the arm rests before its next line."""
         self.sent += by_s
         self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
 
     def update(self, seen: Seen, rate: float) -> str:
-        """Process a report; return in words how the arm is off its path for too long, or ''."""
+        """Process a report; return in words how the arm is off its path, '' if it is not.
+
+        Only what lasts for more than `ASTRAY_S` of wall time counts. ``rate``: robot time per wall
+        time.
+        """
         self._allowed_s = allowed_lag_s(self._rules, rate)
         # A clock that runs faster stands still, too, while a busy machine catches up: when a move
         # was sent is then reckoned too late.
@@ -152,7 +160,11 @@ class Following:
         return self._astray if lasts else ''
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why the arm's place on its path is unknown, or ''."""
+        """Return why the arm's place on its path is unknown, or ''.
+
+        It is if the last report is not fresh, or by it the arm has not moved yet for longer than
+        it may lag, is off its path, or loses speed (`_is_slowed`).
+        """
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
         if self._lag_s > self._allowed_s and not self._astray:
@@ -162,8 +174,10 @@ class Following:
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
         """Return why the latest reports do not show the arm going on along its path, or ''.
 
-        For a stop it is enough to know where the arm may be (`lost`). What leads it on is for one
-        that moves: a controller may join it to an arm that has been stopped since by a jump.
+        They do if they come (last one at most `JUST_S` old) and the arm is within `ON_PATH_RAD` of
+        where it should be, or lags without its lag growing by `SLOWED_SHARE` of the time. For a
+        stop it is enough to know where the arm may be (`lost`); what leads it on is for one that
+        moves: a controller may join it to an arm that has been stopped since by a jump.
         """
         if wall_s - seen.wall > JUST_S or not self._trail:
             return 'joint_states do not come'
@@ -185,11 +199,11 @@ class Following:
         return 'the arm is not seen to go on' if grows or stands else ''
 
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
-        """Return between which times on the trajectory the arm is now, s.
+        """Return between which times since its start the arm is on the trajectory now, s.
 
         The later one is where the controller's reference is: a stop takes as long to get there as
-        the move did, give or take `JITTER_S`. Where the last report came late, it has gone on for
-        so long. The earlier one is where an arm is that lags, and that has been stopped by itself
+        the move did, give or take `JITTER_S`. If the last report came late, it has gone on for so
+        long. The earlier one is where an arm is that lags, and that has been stopped by itself
         since the last report.
         """
         reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
@@ -201,12 +215,19 @@ class Following:
         return low_s, elapsed + seen.late_s + jitter
 
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
-        """Whether the arm is at the end of the trajectory, or will be without any command."""
+        """Whether the arm is at the end of the trajectory, or will be without any command.
+
+        It is, with the lag seen last, `JITTER_S` after the trajectory's duration.
+        """
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
         return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
 
     def _look(self, seen: Seen, elapsed: float) -> str:
-        """Deviation of the arm from its path in words, '' if it follows; the lag is kept."""
+        """Deviation of the arm from its path in words, '' if it follows; sets the lag.
+
+        It follows if it is within `ON_PATH_RAD` of the path and, along it, near its place or
+        within the allowed lag and lead. Before it reacts it may stand for `rules.reaction_s`.
+        """
         if not self.reacted:
             still = self._is_still_at_start(seen)
             if still and seen.wall - self._sent_wall <= self._rules.reaction_s:
@@ -238,9 +259,11 @@ class Following:
         )
 
     def _is_slowed(self) -> bool:
-        """Whether the arm loses speed where its path goes on, long before its lag shows it.
+        """Whether the arm loses speed although its path goes on, long before its lag shows it.
 
-        Its path is the trajectory, delayed by about what it lagged a moment ago.
+        It does if in the last `SLOWED_S` to `SLOWED_LONGEST_S` it has gone less than
+        `SLOWED_SHARE` of its path's way (of at least `SLOWED_RAD`). The path is the trajectory,
+        delayed by about what the arm lagged a moment ago. False without reports over such a time.
         """
         if not self._trail:
             return False
@@ -261,7 +284,10 @@ class Following:
         return expected > SLOWED_RAD and moved < SLOWED_SHARE * expected
 
     def _is_still_at_start(self, seen: Seen) -> bool:
-        """Whether nothing of a move has been seen yet; the probe is too short to be seen."""
+        """Whether nothing of a move has been seen yet: the arm is within `arrive_tolerance`.
+
+        False for a move of less than `ON_PATH_RAD`, such as the probe: it is too short to be seen.
+        """
         start, units = self.trajectory.start, self._rules.units
         longest = units.largest(self.trajectory.points - start)
         away = units.largest(seen.q - start)
@@ -270,8 +296,9 @@ class Following:
     def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
         """Return the lag of `q`, s, its offset from the path, (k,), and whether the arm is near.
 
-        Near is what is within `ON_PATH_RAD` of where it should be: at the ends of a line a small
-        distance is a long time.
+        A lead is a negative lag. Near is what is within `ON_PATH_RAD` of where it should be: at
+        the ends of a line a small distance is a long time. The offset is in rad or m. ``elapsed``:
+        time since the start, s.
         """
         trajectory, units = self.trajectory, self._rules.units
         index, since_s = trajectory.line_at(elapsed)

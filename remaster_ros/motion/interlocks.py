@@ -45,7 +45,7 @@ class Interlocks:
         self._looked_wall: float | None = None
 
     def note_alive(self, name: str, reason: str, wall_s: float) -> None:
-        """Process a sign of life of an origin, with its reason not to move, or ''."""
+        """Note a sign of life of an origin at `wall_s`, s, and its reason not to move, or ''."""
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, state: str, run: str, wall_s: float) -> bool:
@@ -82,7 +82,10 @@ class Interlocks:
         return self._reasons.get(name) == ''
 
     def look(self, wall_s: float) -> None:
-        """Shift the last signs of life by a pause of this process: the others were not silent."""
+        """Shift the last signs of life by a pause of this process: the others were not silent.
+
+        A pause is more than `OWN_PAUSE_S` between two calls. ``wall_s``: now, s.
+        """
         last, self._looked_wall = self._looked_wall, wall_s
         if last is None or wall_s - last <= OWN_PAUSE_S:
             return
@@ -95,7 +98,10 @@ class Interlocks:
         return wall_s - self._seen[name] if name in self._seen else np.inf
 
     def fell_silent(self, name: str, wall_s: float) -> str:
-        """Return that an origin which gave signs of life is silent now; '' if it is not."""
+        """Return that an origin which gave signs of life is silent now; '' if it is not.
+
+        Silent is for more than `heartbeat_s`; '' also if it has given none.
+        """
         if name in self._seen and self.silence_s(name, wall_s) > self._heartbeat_s:
             return f'no sign of {name} for {self._heartbeat_s:g} s'
         return ''
@@ -140,9 +146,11 @@ class Interlocks:
         self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
-        """After a long interruption let a person go on, who may stand beside the arm meanwhile.
+        """Hold the consent while something is in the way, and ask a person after a long time.
 
-        Where the robot itself reported all the time that nobody has stopped it, none is needed.
+        Only after the arm was moved in this run. Longer than `resume_alone_s` a person may stand
+        beside the arm; none is needed if the robot itself reported all the time that it is not
+        stopped.
         """
         released = self._is_released
         reason = self._hindrance(wall_s)
@@ -166,7 +174,7 @@ class Interlocks:
             self.say(Word.FREE)
 
     def blocked(self, wall_s: float) -> str:
-        """Return the first reason not to move, or ''."""
+        """Return the first reason not to move (silence, trouble, a person's consent), or ''."""
         return self._hindrance(wall_s) or self.asks_for_collect
 
     @property
@@ -176,7 +184,7 @@ class Interlocks:
         return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 
     def _hindrance(self, wall_s: float) -> str:
-        """First reason not to move (a silent node, a trouble), or ''."""
+        """First reason not to move: silent nodes, then reasons in the order of the names; ''."""
         limit = self._heartbeat_s
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:

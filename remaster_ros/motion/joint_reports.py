@@ -144,14 +144,20 @@ class JointReports:
 
     @property
     def is_on_time(self) -> bool:
-        """Whether stamps are known to be of the node's clock, and to come at once."""
+        """Whether stamps are known to be of the node's clock, and to come at once.
+
+        That is, within `SAME_CLOCK_S` times the clock's rate; False before the delay is learned.
+        """
         if self._delay is None:
             return False
         # A clock that runs fast is published in steps.
         return abs(self._delay) <= SAME_CLOCK_S * max(self.clock.rate, 1.0)
 
     def believes(self, report: JointReport) -> bool:
-        """Return whether a report is believed; else `kind` and `trouble` are the reason."""
+        """Return whether a report is believed; else `kind` and `trouble` are the reason.
+
+        A report that is believed becomes the last one, and its delay is learned.
+        """
         self.clock.update(report.clock_s, report.wall_s)
         self.kind, self.trouble = self._doubt(report)
         if self.kind:
@@ -164,7 +170,11 @@ class JointReports:
         return True
 
     def _doubt(self, report: JointReport) -> tuple[str, str]:
-        """Return why a report is not believed, as a key of the counts and as text."""
+        """Return why a report is not believed, as a key of the counts and as text; '', ''.
+
+        In this order: not finite; outside the limits by more than `LIMIT_TOLERANCE_RAD`; a stamp
+        that does not advance; faster than `SPEED_TOLERANCE` times the limit; late or early.
+        """
         q, last = report.q, self._last
         if not np.all(np.isfinite(q)):
             return 'not_finite', 'joint_states are not finite'

@@ -36,11 +36,14 @@ class JointUnits:
         return np.where(self.slides, LEVER_M, 1.0) if self.slides else np.ones(1)
 
     def slide(self, joint: int) -> bool:
-        """Tell whether a joint slides."""
+        """Whether a joint slides; ``joint``: its index from 0."""
         return bool(self.slides) and self.slides[joint]
 
     def largest(self, ways: FloatArray) -> float:
-        """Return the largest of ways (..., k), as an angle, rad."""
+        """Return the largest absolute entry of ways (..., k), rad or m, as an angle, rad.
+
+        A slide counts 1 / `LEVER_M` rad per m. Raises ValueError if there are no entries.
+        """
         return float(np.max(np.abs(ways) / self.per_radian))
 
     def farthest(self, way: FloatArray) -> int:
@@ -50,12 +53,19 @@ class JointUnits:
     # As people read them
 
     def in_degrees(self, joint: int, value: float, digits: int = 2, sign: str = '') -> str:
-        """Return a joint's position or way as text, in degrees or, if it slides, in mm."""
+        """Return a joint's position or way, rad or m, as text in degrees or, if it slides, mm.
+
+        ``joint``: its index from 0; ``digits``: decimals; ``sign``: '+' to show that of positive
+        values.
+        """
         shown, unit = (1e3 * value, 'mm') if self.slide(joint) else (np.rad2deg(value), 'deg')
         return f'{shown:{sign}.{digits}f} {unit}'
 
     def in_radians(self, way: FloatArray, digits: int) -> str:
-        """Return the largest joint motion of a way (k,), as text without sign, in rad or mm."""
+        """Return the largest joint motion of a way (k,), as text without sign, in rad or mm.
+
+        ``digits``: decimals of rad; mm have two fewer.
+        """
         joint = self.farthest(way)
         value = abs(float(way[joint]))
         if self.slide(joint):
@@ -64,7 +74,11 @@ class JointUnits:
         return f'{value:.{digits}f} rad'
 
     def rate(self, joint: int, value: float, per: str) -> tuple[str, str]:
-        """Return a joint's speed (`per` s) or acceleration (s2) as a number, and its unit."""
+        """Return a joint's speed or acceleration as a number, and its unit, as text.
+
+        ``value``: rad or m per time; ``per``: 's' or 's2'. A slide has mm, one decimal; others
+        rad, three.
+        """
         if self.slide(joint):
             return f'{1e3 * value:.1f}', f'mm/{per}'
         return f'{value:.3f}', f'rad/{per}'

@@ -49,11 +49,14 @@ class LedLast:
         return self._places[-1] if self._places else None
 
     def lead_to(self, *places: FloatArray) -> None:
-        """Process a command that leads to a position, rad or m, (k,), or between several."""
+        """Note a command that leads to a position, rad or m, (k,), or between several of them."""
         self._before, self._places = self._places, places
 
     def take_back(self) -> None:
-        """Process that the last command was not sent."""
+        """Forget the last command, which was not sent: the positions before it hold again.
+
+        Of two commands in a row only the last one can be taken back.
+        """
         self._places = self._before
 
     def differs(self, q: FloatArray, other: FloatArray) -> bool:
@@ -63,7 +66,8 @@ class LedLast:
     def elsewhere(self, q: FloatArray) -> str:
         """Return that the arm is reported elsewhere than it was led, and what to do; ''.
 
-        ``q``: where it is reported, rad or m, (k,).
+        ``q``: where it is reported, rad or m, (k,). Elsewhere is farther than the tolerance from
+        all places and the lines between them; '' if no place is known.
         """
         if not self._places:
             return ''
@@ -103,7 +107,9 @@ class LedLast:
     def confirm(self, q: FloatArray) -> str:
         """Accept a reported position, (k,), if a person was asked about it before.
 
-        Returns what that person is to compare first; '' if it is accepted.
+        Returns what that person is to compare first (`elsewhere`); '' if it is accepted. It is at
+        the second call within the tolerance of the first, or after `ask`; then it is where the arm
+        was led.
         """
         asked, self._asked = self._asked, q
         if asked is None or self.differs(asked, q):

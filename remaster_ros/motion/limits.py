@@ -100,12 +100,18 @@ class MotionLimits:
         return self.margin * self.units.per_radian
 
     def shown(self, joint: int, low: float, high: float) -> str:
-        """Return two limits of a joint as text, in degrees or mm."""
+        """Return two limits of a joint as text: ``[low, high] deg``, or mm if it slides.
+
+        ``joint``: its index from 0; ``low, high``: rad or m.
+        """
         first, last = (self.units.in_degrees(joint, value) for value in (low, high))
         return f'[{first.split()[0]}, {last.split()[0]}] {last.split()[1]}'
 
     def outside(self, q: FloatArray) -> str:
-        """Return the joint of `q`, rad or m, (k,), that is outside its limits, as text; or ''."""
+        """Return as text which joint of `q`, rad or m, (k,), is outside its limits; or ''.
+
+        The limits are those less the margin; the first such joint is named. NaN is outside.
+        """
         bad = ~((self.lower + self.margins <= q) & (q <= self.upper - self.margins))
         if not np.any(bad):
             return ''

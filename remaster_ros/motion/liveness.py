@@ -91,7 +91,10 @@ class Liveness:
             self._new.discard(sensor)
 
     def reads(self, sensor: str, now_s: float) -> None:
-        """Process that there was a reading."""
+        """Count a reading of a sensor at `now_s`, s; it shows that a stream is there again.
+
+        Raises KeyError for an unknown sensor.
+        """
         self.readings[sensor] += 1
         self._read[sensor] = now_s
         self._new.discard(sensor)
@@ -101,10 +104,12 @@ class Liveness:
         return now_s - self._read.get(sensor, float('-inf'))
 
     def absent(self, now_s: float, required: Collection[str] = ()) -> dict[str, str]:
-        """Return why each absent sensor counts as absent.
+        """Return why each absent sensor counts as absent, by name; {} if none is.
 
-        A sensor whose node never reported is not absent, because a bag may hold readings alone.
-        One that is ``required`` is, while its node may still be starting.
+        Its node is silent for more than `heartbeat_s`, or reports that it is not ready; a stream
+        without a reading since its node's start is absent too. A sensor whose node never reported
+        is not, because a bag may hold readings alone; one that is ``required`` is, while its node
+        may still be starting.
         """
         why = {}
         for name in self.readings:

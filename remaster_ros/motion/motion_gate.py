@@ -164,7 +164,9 @@ class MotionGate:
         """Return the next piece of the move under way, in place of the present one.
 
         ``sent_s``: time since the start of the move, s; ``horizon_s``: as in `admit`.
-        Raises MotionRefusedError as `admit`, LookupError if no move is under way.
+
+        Raises MotionRefusedError as `admit`, also if nothing is left of the move; LookupError if
+        no move is under way.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -183,8 +185,11 @@ class MotionGate:
     def step(self, index: int, q: FloatArray) -> Admitted:
         """Return the step of this number of the move under way, which begins at once.
 
-        ``q``: where the arm stands, rad or m, (k,). The waypoints have times from its beginning.
-        Raises MotionRefusedError: as of `admit`; LookupError: no move is under way.
+        ``index``: of the line of the trajectory, from 0; ``q``: where the arm stands, rad or m,
+        (k,). The waypoints have times from the step's beginning.
+
+        Raises MotionRefusedError as `admit`; StartMovedError, one of these, if the arm stands more
+        than `START_RAD` from the start; LookupError if no move is under way.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -207,11 +212,12 @@ class MotionGate:
 
         A controller begins it where the arm really is. It has a single waypoint, so far ahead in
         time that from anywhere within the limits of the doubtful joints no speed and no
-        acceleration is above its limit.
+        acceleration is above its limit. It cannot be stopped by `stop`.
 
         ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad or m, (k,);
         ``doubtful``: which joints may be elsewhere, (k,).
-        Raises MotionRefusedError: as of `admit`.
+
+        Raises MotionRefusedError as `admit`, also if it would take longer than `LONGEST_S`.
         """
         limits = self.limits
         farthest = np.maximum(q - limits.lower, limits.upper - q)
@@ -276,7 +282,10 @@ class MotionGate:
     ) -> None:
         """Check each cubic from a start state on, which must end at rest.
 
-        Raises MotionRefusedError.
+        Raises MotionRefusedError: limits less their margin (an arm outside may stay there, or go
+        inwards), speeds and accelerations (with `TOLERANCE`), `tool_speed`, more than
+        `ON_PATH_RAD` off the path (on the first cubic also what the arm stands off), or longer
+        than `LONGEST_S`.
         """
         units, q = limits.units, start.q
         low = np.minimum(limits.lower + limits.margins, q)
@@ -310,7 +319,10 @@ class MotionGate:
             raise MotionRefusedError(_too_long())
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
-        """Raise MotionRefusedError if a point of arm or tool is faster than `tool_speed`."""
+        """Raise MotionRefusedError if a point of arm or tool is faster than `tool_speed`.
+
+        Looked at every `SAMPLE_RAD`, with `TOLERANCE`; no check without a limit or `speeds`.
+        """
         if self._speeds is None or not np.isfinite(limits.tool_speed):
             return
         way = piece.at(piece.duration_s) - piece.at(0.0)
@@ -405,9 +417,9 @@ class ForeignGate:
     def brake(self, q: FloatArray, velocity: FloatArray) -> Admitted:
         """Return an even stop of an arm that goes on in its direction meanwhile.
 
-        The controller is to hold it at once where the stop would lead beyond a limit.
-
-        ``q, velocity``: where the arm is, rad or m, and how fast, (k,).
+        It takes `STOP_S`, or longer for the accelerations. Without waypoints (the controller holds
+        the arm at once) if the stop would lead beyond a limit. ``q, velocity``: where the arm is,
+        rad or m, and how fast, per s, (k,).
         """
         limits = self.limits
         hardest = float(np.max(np.abs(velocity) / limits.acceleration))
@@ -418,7 +430,10 @@ class ForeignGate:
         return Admitted((Waypoint(time_s, end, np.zeros_like(end)),))
 
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
-        """Raise StartMovedError if the trajectory does not begin at the arm, at rest."""
+        """Raise StartMovedError if the trajectory does not begin at the arm, at rest.
+
+        It may begin `START_RAD` away, and the arm may move at `SLOW_RAD_S`.
+        """
         off, units = np.abs(first.q - q), self.limits.units
         if not units.largest(off) <= START_RAD:
             joint = units.farthest(off)
@@ -434,7 +449,7 @@ def _too_long() -> str:
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
-    """Limits for a slow way out of a contact."""
+    """Limits for a slow way out of a contact: `WAY_OUT_SPEED`, `WAY_OUT_TOOL_SPEED`."""
     return replace(
         limits,
         velocity=WAY_OUT_SPEED * limits.velocity,
@@ -445,7 +460,10 @@ def _way_out_limits(limits: MotionLimits) -> MotionLimits:
 def _check_range(
     least: FloatArray, most: FloatArray, low: FloatArray, high: FloatArray, limits: MotionLimits
 ) -> None:
-    """Raise MotionRefusedError if joints, from `least` to `most`, leave `low` to `high`, (k,)."""
+    """Raise MotionRefusedError if joints, from `least` to `most`, leave `low` to `high`, (k,).
+
+    To rounding, 1e-9. ``limits``: for names and units.
+    """
     # To rounding: an arm that stands outside may stay there, and go inwards.
     bad = (least < low - 1e-9) | (most > high + 1e-9)
     if np.any(bad):
@@ -462,7 +480,8 @@ def _check_rate(
 ) -> None:
     """Raise MotionRefusedError if a joint's largest rate, (k,), is above the allowed rate.
 
-    ``what``: 'speed' or the like; ``per``: unit of time for the message.
+    By more than `TOLERANCE`; NaN is above. ``what``: 'speed' or the like; ``per``: unit of time
+    for the message, 's' or 's2'.
     """
     bad = ~(largest <= allowed * (1.0 + TOLERANCE))
     if np.any(bad):
@@ -484,7 +503,10 @@ class Cubic:
 
     @classmethod
     def between(cls, before: Waypoint, after: Waypoint) -> Cubic:
-        """Return the cubic that meets positions and velocities of both (Hermite)."""
+        """Return the cubic that meets positions and velocities of both (Hermite).
+
+        Its coefficients are not finite if both have the same time.
+        """
         duration_s = after.time_s - before.time_s
         return cls.hermite(duration_s, before.q, before.velocity, after.q, after.velocity)
 
@@ -497,7 +519,10 @@ class Cubic:
         end_q: FloatArray,
         end_velocity: FloatArray,
     ) -> Cubic:
-        """Return the cubics by Hermite data: durations, s, (n, 1), positions and speeds (n, k)."""
+        """Return the cubics by Hermite data: durations, s, (n, 1), positions and speeds (n, k).
+
+        Coefficients of a duration of 0 are not finite.
+        """
         gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):
             second = (3 * gap / duration_s - 2 * velocity - end_velocity) / duration_s

@@ -62,7 +62,12 @@ class Visit:
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:
-        """Return the outcome of a report for an arm on its way to a configuration."""
+        """Return the outcome of a report for an arm on its way to a configuration.
+
+        'halted' if it is off its path, stands for `stall_s` off its target, or reports the target
+        to the last bit; 'settled'; 'failed' after the deadline; 'over' at the end of a move
+        without a measurement; else UNDER_WAY. ``rate``: robot time per wall time.
+        """
         detector, rules = self.detector, self.rules
         trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
         settled = detector.update(seen.stamp, seen.q) == 'settled'
@@ -98,7 +103,10 @@ class Visit:
         self.deadline += by_s
 
     def settled_at(self, seen: Seen) -> Settled:
-        """Return the action that reports the arm as settled, by the report that completed it."""
+        """Return the action that reports the arm as settled, by the report that completed it.
+
+        The arm must stand still (`SettleDetector.still_since`).
+        """
         still_since = self.detector.still_since
         assert still_since is not None
         motion_s, settle_s = still_since - self.sent_stamp, seen.stamp - still_since
@@ -137,7 +145,11 @@ class Braking:
     units: JointUnits
 
     def judge(self, seen: Seen) -> Outcome:
-        """Return the outcome of a report for a braking arm: 'halted' if it rests elsewhere."""
+        """Return the outcome of a report for a braking arm.
+
+        'over' if it stands within `near` of the stop's end; 'halted' if it stands elsewhere, or
+        goes on after the deadline; else UNDER_WAY.
+        """
         stands, way = seen.stands(seen.wall), seen.q - self.end
         off, text = self.units.largest(way), self.units.in_radians(way, 4)
         elsewhere = f'the arm stands {text} from where its stop led: an emergency stop?'
@@ -231,10 +243,12 @@ class MotionUnderWay:
     ) -> Drive:
         """Return the move along a free path, which is under way in the state that follows.
 
-        ``solution``: its number; ``path``: from where the arm stands; ``seen``: the last report;
-        ``wall_s``: now, s; ``rate``: seconds of the robot per second of wall time; ``doubtful``:
-        for a probe, which joints may be elsewhere than reported, (k,).
-        Raises MotionRefusedError: as of `MotionGate.admit`; nothing is under way then.
+        ``solution``: its index, negative for a probe or a way out; ``path``: from where the arm
+        stands; ``seen``: the last report; ``wall_s``: now, s; ``rate``: seconds of the robot per
+        second of wall time; ``doubtful``: for a probe, which joints may be elsewhere than
+        reported, (k,). Sets `visit` and `led`.
+
+        Raises MotionRefusedError as `MotionGate.admit`; nothing is under way then.
         """
         if doubtful is None:
             admitted = self.gate.admit(
@@ -272,7 +286,12 @@ class MotionUnderWay:
         return self._horizon_s - RAMP_S - GUARD_S - RENEWED_S
 
     def due(self, seen: Seen, wall_s: float) -> Literal['', 'renew', 'missed']:
-        """Return whether the next piece of the move is due, or comes too late."""
+        """Whether the next piece of the move is due ('renew'), or too late ('missed'); '' if not.
+
+        ``wall_s``: now, s. With stamps it is due `RENEWED_S` after the last one, and too late
+        `GUARD_S` before the piece's stop begins. Else it is due when the arm stands at the piece's
+        end. '' after the last piece.
+        """
         piece, visit = self._piece, self.visit
         if piece is None or visit is None or piece.is_last:
             return ''
@@ -288,7 +307,11 @@ class MotionUnderWay:
         return 'renew' if elapsed_s >= max(self._piece_sent_s + RENEWED_S, JOINED_S) else ''
 
     def renew(self, seen: Seen, wall_s: float) -> Renew:
-        """Return the next piece of the move; errors as of `MotionGate.renew`."""
+        """Return the next piece of the move, which is the present one from then on.
+
+        Raises MotionRefusedError as `MotionGate.renew` and `MotionGate.step`. There must be a
+        visit.
+        """
         assert self.visit is not None
         assert self._piece is not None
         following = self.visit.following
@@ -307,7 +330,10 @@ class MotionUnderWay:
         return Renew(admitted, wall_s, begins_s)
 
     def _take(self, piece: Piece | None, sent_s: float, set_back_s: float = 0.0) -> None:
-        """Make a piece the present one, sent at `sent_s` of the motion; keep the previous one."""
+        """Make a piece the present one, sent at `sent_s` of the motion; keep the previous one.
+
+        ``set_back_s``: by how much it begins later than planned, s; for `take_back`.
+        """
         self._piece_before = self._piece, self._piece_sent_s
         self._set_back_s = set_back_s
         self._piece, self._piece_sent_s = piece, sent_s
@@ -321,7 +347,10 @@ class MotionUnderWay:
         self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
-        """Return the outcome of a report for the move or the stop; see `Visit` and `Braking`."""
+        """Return the outcome of a report for the move or the stop; UNDER_WAY without either.
+
+        See `Visit` and `Braking`. How far the arm has settled from its target is kept, for `near`.
+        """
         if self.braking is not None:
             return self.braking.judge(seen)
         if self.visit is None:
@@ -334,12 +363,15 @@ class MotionUnderWay:
         return outcome
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why a moving arm's place on its path is unknown, or ''."""
+        """Return why a moving arm's place on its path is unknown, or ''; see `Following.lost`."""
         assert self.visit is not None
         return self.visit.following.lost(seen, wall_s)
 
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
-        """Return why reports do not show a moving arm going on along its path, or ''."""
+        """Return why reports do not show a moving arm going on along its path, or ''.
+
+        See `Following.unseen`; '' for a controller that does not keep stamps, whose arm stands.
+        """
         assert self.visit is not None
         if not self._keeps_stamps:
             # It stands where its next step begins.
@@ -349,8 +381,9 @@ class MotionUnderWay:
     def stop(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop | None:
         """Return the stop of a moving arm that is not `lost`, along the rest of its line.
 
-        It is under way in the state that follows. None is needed where the arm is at its end, or
-        will be without any command.
+        It is watched from then on (`braking`). None, and nothing is changed, if the arm is at its
+        end or will be without any command. ``reason``: for people; ``wall_s``: now, s; ``rate``:
+        robot time per wall time. There must be a visit.
         """
         assert self.visit is not None
         following = self.visit.following
@@ -379,7 +412,10 @@ class MotionUnderWay:
         self.braking = Braking(end, begins, over, deadline, self.near, patience_s, units)
 
     def take_back(self) -> None:
-        """Process that the last command was not sent."""
+        """Forget the last command, which was not sent: end, piece and times before it hold again.
+
+        The state is not changed.
+        """
         self.led.take_back()
         self._piece, self._piece_sent_s = self._piece_before
         if self.visit is not None and self._set_back_s:

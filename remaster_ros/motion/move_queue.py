@@ -53,7 +53,7 @@ class MoveQueue:
         waypoints: Mapping[int, FloatArray],
         refused: Mapping[int, str],
     ) -> None:
-        """Begin another pose; see `ArmSupervisor.plan`."""
+        """Begin another pose, with its first solution next; see `ArmSupervisor.plan`."""
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
         self._refused = refused
 
@@ -62,12 +62,12 @@ class MoveQueue:
         self.place = after(PLACE, self.place, finding)
 
     def clear_halt(self) -> None:
-        """Process that a person has cleared a halt, which allows the way out that was offered."""
+        """Note that a person has cleared a halt, which allows the way out that was offered."""
         self._way_out, self._offered = self._offered, None
         self.found(Finding.CLEARED if self._way_out is None else Finding.ALLOWED)
 
     def take_way_out(self) -> FreePath:
-        """Return the way out that is allowed, once."""
+        """Return the way out that is allowed, once; there must be one."""
         path, self._way_out = self._way_out, None
         assert path is not None
         self.found(Finding.LEFT)
@@ -84,7 +84,11 @@ class MoveQueue:
         return self._refused.get(self.next, '')
 
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
-        """Return the question whether the way to a solution is free, (k,) each."""
+        """Return the question whether the way to a solution is free, with a new number.
+
+        ``solution``: its index, or `STANDING`; ``start, target``: rad or m, (k,). The planner's
+        waypoints to it are included. `asked` answers for the last question only.
+        """
         self._requests += 1
         none = np.empty((0, len(target)))
         asked = CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
@@ -92,7 +96,10 @@ class MoveQueue:
         return asked
 
     def asked(self, number: int) -> tuple[int, FloatArray] | None:
-        """Return the solution and the start, (k,), of the last question if it has this number."""
+        """Return the solution and the start, (k,), of the last question if it has this number.
+
+        None if it has another one, or none was asked.
+        """
         if self._asked is None or self._asked[1].number != number:
             return None
         return self._asked[0], self._asked[1].start
@@ -122,7 +129,8 @@ class MoveQueue:
 def probe_path(q: FloatArray, limits: MotionLimits) -> FreePath:
     """Return the way to a place `PROBE_RAD` from `q`, where the arm stands (rad or m, (k,)).
 
-    A measurement does not agree with it to the last bit.
+    Each joint goes towards the middle of its range. A measurement does not agree with the end to
+    the last bit.
     """
     low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
     step = PROBE_RAD * limits.units.per_radian

@@ -98,7 +98,7 @@ class PointSpeeds:
         return float(np.max(self.fastest(q, np.broadcast_to(way, q.shape))))
 
     def peaks_m(self, points: FloatArray) -> tuple[float, ...]:
-        """Return `peak_m` of each line of a polyline, m/s, for points (n, k), rad."""
+        """Return `peak_m` of each line of a polyline, m/s, for points (n, k), rad or m."""
         return tuple(self.peak_m(start, end) for start, end in pairwise(points))
 
 
@@ -136,7 +136,10 @@ class FreePath:
     way_out: bool = False  # It leads out of a contact or a margin, and is gone slowly
 
     def off(self, q: FloatArray, units: JointUnits) -> FloatArray:
-        """Return the way to a configuration (rad or m, (k,)) from the nearest of the polyline."""
+        """Return the way to a configuration (rad or m, (k,)) from the nearest on the polyline.
+
+        Nearest along each line by the sum of squares, among the lines by the largest joint.
+        """
         points = self.points / units.per_radian
         starts, ways, here = points[:-1], np.diff(points, axis=0), q / units.per_radian
         lengths = np.sum(ways**2, axis=1)

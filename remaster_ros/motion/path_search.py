@@ -30,7 +30,8 @@ class PathSearch:
     def find(self, request: CheckPath) -> PathAnswer:
         """Free path for a request: the planned one, or another.
 
-        Without one: what is in the way and, from a start that is not free, a way out if known.
+        Without one: what is in the way and, from a start that is not free, a way out if known. The
+        same request always has the same answer. It takes up to seconds.
         """
         rng = np.random.default_rng(SEED)
         at_start = self._model.trouble(request.start)
@@ -48,4 +49,5 @@ class PathSearch:
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
 
     def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
+        """Return points (n, k) as a path, with the peak speeds of its lines."""
         return FreePath(points, self._speeds.peaks_m(points), is_way_out)

@@ -79,9 +79,10 @@ class Piece:
 
 
 def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
-    """Return the piece of a trajectory to be sent at a time, s from its start.
+    """Return the piece of a trajectory to be sent at `sent_s`, s from its start.
 
-    ``horizon_s``: time from then to the piece's end, s.
+    ``horizon_s``: time from then to the piece's end, s. It begins before `sent_s`, by up to
+    `PAST_S`, and is the last one if the trajectory ends within the horizon.
     """
     piece = _piece(trajectory, sent_s, horizon_s)
     following = _piece(trajectory, sent_s + RENEWED_S, horizon_s)[0]
@@ -89,7 +90,10 @@ def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
 
 
 def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
-    """Return a trajectory along the same lines that rests every `horizon_s` at the latest."""
+    """Return a trajectory along the same lines that rests every `horizon_s` at the latest.
+
+    Each line is cut into equal steps, from rest to rest, with `STEP_REST_S` between them.
+    """
     lines: list[Line] = []
     for line in trajectory.lines:
         count = max(int(np.ceil((1.0 / line.rate) / (horizon_s - RAMP_S) - SAME_S)), 1)
@@ -102,7 +106,7 @@ def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
 
 
 def step_of(trajectory: Trajectory, index: int) -> Piece:
-    """Return the line of this number as a piece."""
+    """Return the line of this number, from 0, as a piece. Raises IndexError if there is none."""
     line, start_s = trajectory.lines[index], trajectory.starts_s[index]
     points = tuple(replace(p, time_s=start_s + p.time_s) for p in line.waypoints())
     is_last = index + 1 == len(trajectory.lines)
@@ -114,7 +118,11 @@ def step_of(trajectory: Trajectory, index: int) -> Piece:
 def _piece(
     trajectory: Trajectory, sent_s: float, horizon_s: float
 ) -> tuple[tuple[Waypoint, ...], float]:
-    """Return the waypoints and until when the arm is on the trajectory, s."""
+    """Return the waypoints, and until when the arm is on the trajectory, s (inf for the last).
+
+    Behind that is a stop in `RAMP_S` on the line; a line's own ramp is taken if the stop would
+    fall into it.
+    """
     begins_s = max(sent_s - PAST_S, min(sent_s - LEAST_PAST_S, RAMP_S), 0.0)
     points = [p for p in trajectory.waypoints() if p.time_s > begins_s + SAME_S]
     if begins_s > 0.0:

@@ -35,7 +35,11 @@ class Facts:
 
 
 def preflight(facts: Facts) -> tuple[str, ...]:
-    """Return obstacles to the first motion, one line each; () if it may begin."""
+    """Return obstacles to the first motion, one line each; () if it may begin.
+
+    What is older than `FRESH_S` is missing. Troubles of sensors count unless `any_sensor`, and one
+    of them is ready.
+    """
     findings = []
     if facts.joints_message:
         findings.append(facts.joints_message)

@@ -39,7 +39,10 @@ class DuplicateNodeCheck:
         self._uptimes_s: dict[str, float] = {}
 
     def update_own(self, now_s: float) -> None:
-        """Process the receipt of this node's own summary: it would receive others', too."""
+        """Note the receipt of this node's own summary: it would receive others', too.
+
+        ``now_s``: of a monotonic clock, s. Only the first one counts.
+        """
         if self.alone_since_s is None:
             self.alone_since_s = now_s
 
@@ -73,5 +76,5 @@ class DuplicateNodeCheck:
         return shorter_by_s > SHORTER_S
 
     def alone(self, now_s: float) -> bool:
-        """Whether this node has listened for long enough without a summary of a rival."""
+        """Whether this node has listened for `LISTEN_S` without a summary of a rival."""
         return self.alone_since_s is not None and now_s - self.alone_since_s >= LISTEN_S

@@ -59,10 +59,12 @@ class SettleDetector:
         self._still: _Standstill | None = None
 
     def update(self, stamp: float, q: FloatArray) -> SettleState:
-        """Process one report and return the state; 'moving' if a position is not finite.
+        """Process one report and return the state.
 
         ``stamp``: time of the report, s; ``q``: reported joint positions in the order of the
-        target, rad or m, (k,).
+        target, rad or m, (k,). Still for `settle_s`: 'settled' within `arrive_tolerance` of the
+        target, else 'elsewhere'. Before that: 'settling' and 'moving'; 'moving' also if a position
+        is not finite.
         """
         if not np.all(np.isfinite(q)):
             self._still = None
@@ -74,7 +76,10 @@ class SettleDetector:
         return 'settled' if waited else 'settling'
 
     def _goes_on(self, stamp: float, q: FloatArray) -> _Standstill | None:
-        """Return the standstill extended by a report; None if it has ended or has not begun."""
+        """Return the standstill extended by a report; None if it has ended or has not begun.
+
+        It ends with a spread above `still_tolerance`, a gap above `max_gap_s` or an earlier stamp.
+        """
         still = self._still
         if still is None or not 0.0 <= stamp - still.last <= self.rules.max_gap_s:
             return None
@@ -90,13 +95,16 @@ class SettleDetector:
 
     @property
     def farthest(self) -> float:
-        """Largest distance of a report from the target since the arm stands still, rad."""
+        """Largest distance of a report from the target since the arm stands still, rad.
+
+        The arm must stand still. A slide counts as in `JointUnits`.
+        """
         assert self._still is not None
         ends = np.array([self._still.low, self._still.high])
         return self.rules.units.largest(ends - self.target)
 
     @property
     def mean(self) -> FloatArray:
-        """Mean reported position since the arm stands still, rad or m, (k,)."""
+        """Mean reported position since the arm stands still, rad or m, (k,); it must stand."""
         assert self._still is not None
         return self._still.total / self._still.count

@@ -41,7 +41,8 @@ def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) 
     """Return position and time at which an arm on a line comes to rest if it stops now.
 
     ``low_s, high_s``: the arm's place is that of the line at a time between these, s since its
-    start; ``limits``: for the accelerations.
+    start; ``limits``: for the accelerations. The shortest stop of at least `STOP_S` that is right
+    from all of these places; else the longest shorter one; else one in the time left on the line.
     """
     stretch = _Stretch(line, low_s, high_s, limits)
     longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))
@@ -65,7 +66,11 @@ class _Stretch:
         self._hardness = float(np.max(np.abs(line.way) / limits.acceleration))
 
     def first(self, times: FloatArray) -> tuple[float, float] | None:
-        """Return time (s) and end (share) of the first stop that is right; None if none is."""
+        """Return time (s) and end (share) of the first stop that is right; None if none is.
+
+        ``times``: durations to try, s, (n,), in this order. Right is the inequality of the module,
+        and accelerations of at most `HEADROOM` times the limit.
+        """
         x, v, T = self._x[:, None], self._v[:, None], times
         least = np.max(x + v * T / 3, axis=0)
         most = np.minimum(np.min(x + self._rate * T * 2 / 3, axis=0), 1.0)
@@ -81,7 +86,11 @@ class _Stretch:
         return None
 
     def rest_of_line(self) -> tuple[float, float]:
-        """Return time and end of a stop in the time that the slowest has left on the line."""
+        """Return time and end of a stop in the time that the slowest has left on the line.
+
+        The end, a share of the line, is the farthest at which no arm of the stretch passes the
+        line's end.
+        """
         time = max(self._left_s, 1.5 * (1.0 - self._x[0]) / self._rate, END_OF_STOP_S)
         low, high = -1.0, 1.0
         for _ in range(ROUNDS):
@@ -90,7 +99,10 @@ class _Stretch:
         return time, low
 
     def _coefficients(self, time: float, end: float) -> tuple[FloatArray, FloatArray]:
-        """Return second and third coefficients of the cubics, of powers of the time's share."""
+        """Return second and third coefficients of the cubics, of powers of the time's share.
+
+        One for each place; ``time``: of the stop, s; ``end``: share of the line.
+        """
         gap, v = end - self._x, self._v * time
         return 3 * gap - 2 * v, v - 2 * gap
 

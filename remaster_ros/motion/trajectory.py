@@ -55,10 +55,11 @@ class Line:
     def within(
         cls, limits: MotionLimits, start: FloatArray, end: FloatArray, peak_m: float = 0.0
     ) -> Line:
-        """Return the fastest line within the speeds and accelerations.
+        """Return the fastest line within the speeds and accelerations, less `HEADROOM`.
 
-        ``start, end``: rad, (k,); ``peak_m``: speed of the fastest point of arm and tool where the
-        whole way takes a second, m/s.
+        ``start, end``: rad or m, (k,); ``peak_m``: speed of the fastest point of arm and tool if
+        the whole way takes a second, m/s; 0 for no such limit. Accelerations count `STOPPABLE`
+        times.
         """
         way = np.maximum(np.abs(end - start), 1e-12)
         # The ramp is of a given length: what the joints may accelerate bounds the speed as well.
@@ -72,7 +73,7 @@ class Line:
 
     @property
     def way(self) -> FloatArray:
-        """From start to end, rad, (k,)."""
+        """From start to end, rad or m, (k,)."""
         return self.end - self.start
 
     @property
@@ -91,7 +92,7 @@ class Line:
         return RAMP_S, RAMP_S + self.cruise_s
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the end of each phase."""
+        """Return the ends of ramp up, cruise and ramp down; no cruise if there is none."""
         velocity, ramp = self.rate * self.way, 0.5 * RAMP_S * self.rate * self.way
         points = [Waypoint(RAMP_S, self.start + ramp, velocity)]
         if self.rate * RAMP_S < NO_CRUISE:
@@ -100,14 +101,17 @@ class Line:
         return tuple(points)
 
     def share(self, time_s: float) -> tuple[float, float]:
-        """Return the share of the line covered at a time, and its rate, 1/s."""
+        """Return the share of the line covered at a time, s since its start, and its rate, 1/s.
+
+        Before the start 0, after the end 1, at rate 0.
+        """
         # The speed goes up from the start, and down by as much from where it is to be lost.
         up, gone_up = _ramp(time_s)
         down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
         return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
 
     def time_s(self, share: float) -> float:
-        """Return when a share of the way (0 to 1) is gone, s: the inverse of `share`."""
+        """Return when a share of the way is gone, s: the inverse of `share`; clipped to 0 … 1."""
         share = min(max(share, 0.0), 1.0)
         ramp = 0.5 * RAMP_S * self.rate
         if share <= ramp:
@@ -117,7 +121,11 @@ class Line:
         return 0.5 * RAMP_S + share / self.rate
 
     def project(self, q: FloatArray, units: JointUnits = TURNING) -> tuple[float, float]:
-        """Return the share of the way nearest to `q` (k,), and how far `q` is off, rad."""
+        """Return the share of the way (0 to 1) nearest to `q` (k,), and how far `q` is off, rad.
+
+        Nearest by the sum of squares; the distance is of the farthest joint. A line without a way
+        has the share 1.
+        """
         way, gone = self.way / units.per_radian, (q - self.start) / units.per_radian
         length = float(way @ way)
         share = float(np.clip(way @ gone / length, 0.0, 1.0)) if length else 1.0
@@ -157,7 +165,7 @@ class Trajectory:
 
     @property
     def points(self) -> FloatArray:
-        """The polyline, rad, (n + 1, k) for n lines."""
+        """The polyline, rad or m, (n + 1, k) for n lines."""
         return np.array([self.lines[0].start, *(line.end for line in self.lines)])
 
     @property
@@ -166,7 +174,10 @@ class Trajectory:
         return self.starts_s[-1] + self.lines[-1].duration_s
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the waypoints for the controller."""
+        """Return the waypoints for the controller: those of the lines, and the end of each rest.
+
+        Times are from the trajectory's start; where it starts is no waypoint.
+        """
         points: list[Waypoint] = []
         for start_s, line in zip(self.starts_s, self.lines):
             if start_s:
@@ -176,15 +187,19 @@ class Trajectory:
         return tuple(points)
 
     def line_at(self, time_s: float) -> tuple[int, float]:
-        """Return the index of the line under way at a time, and the time since its start, s.
+        """Return the index, from 0, of the line under way at a time, and the time since its start.
 
-        A rest after a line belongs to the line.
+        In s. A rest after a line belongs to the line; before the start it is the first line, with
+        a negative time.
         """
         index = max(bisect_right(self.starts_s, time_s) - 1, 0)
         return index, time_s - self.starts_s[index]
 
     def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
-        """Return joint positions, rad or m, and velocities, per s, at a time, (k,) each."""
+        """Return joint positions, rad or m, and velocities, per s, at a time, s, (k,) each.
+
+        Before the start and after the end the arm stands.
+        """
         index, since_s = self.line_at(time_s)
         line = self.lines[index]
         share, rate = line.share(since_s)
