@@ -34,13 +34,19 @@ THEORETICAL = ('theoretical', 'paper_theoretical')
 
 
 def summary(errors: FloatArray) -> dict[str, Any]:
-    """Mean and 95 % interval of errors in m as ``mean_mm`` and ``interval95_mm``."""
+    """Mean and 95 % interval of errors (n,), m, as ``mean_mm`` and ``interval95_mm``, in mm.
+
+    The interval is from the 2.5 to the 97.5 % quantile. At least one error is needed.
+    """
     low, high = np.quantile(errors, (0.025, 0.975)) * 1e3
     return {'mean_mm': float(np.mean(errors) * 1e3), 'interval95_mm': [float(low), float(high)]}
 
 
 def unavailable(names: Sequence[str], why: str) -> dict[str, Any]:
-    """Metric without numbers, with the reason why the session has none."""
+    """Entry of a metric without numbers: None for each of the names, and the reason as ``why``.
+
+    ``names``: keys that the metric would have, such as 'before' and 'after'.
+    """
     return {**dict.fromkeys(names), 'why': why}
 
 
@@ -146,7 +152,11 @@ def _measured(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """The two metrics that need no posterior, of the chosen rows and pairs."""
+    """The metrics of eq. 17 and 18 before and after, of the chosen rows: dict for fit.json.
+
+    'relative' is over ``pairs`` (m, 2), and has the reason ``why`` in place of numbers without
+    pairs; 'post_registration' is over ``chosen`` (c,). Both arrays are indices of measurements.
+    """
     predicted = {'before': predicted_before, 'after': predicted_after}
     if len(pairs) > 0:
         relative = {
@@ -168,7 +178,11 @@ def _measured(
 
 
 def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
-    """Summaries of the invariant version and of the paper's version."""
+    """Summaries of the invariant version and of the paper's version, in this order in ``both``.
+
+    Keys are 'theoretical' and 'paper_theoretical', each with the suffix; values are `summary` of
+    each field of `Distances`.
+    """
     return {
         name + suffix: {side: summary(values) for side, values in distances._asdict().items()}
         for name, distances in zip(THEORETICAL, both, strict=True)

@@ -92,12 +92,16 @@ class Arrangement:
 
     @classmethod
     def given(cls, joints: int) -> Arrangement:
-        """Arrangement of a table that needs no change."""
+        """Arrangement of a table of this number of joints that needs no change."""
         return cls(tuple(range(joints)), (1,) * joints, (0,) * joints)
 
     @property
     def changes(self) -> int:
-        """Number of changes from the given arrangement; rare ones count more."""
+        """Number of changes from the given arrangement, 0 if there is none; rare ones count twice.
+
+        Two exchanged columns count as one change, each reversed or quarter-turned joint as one;
+        mirrored points and a turned tool count as two.
+        """
         # Two that are exchanged are one thing, and so are all of them tip to base.
         moved = sum(column != joint for joint, column in enumerate(self.order)) // 2
         return (
@@ -119,20 +123,27 @@ class Arrangement:
         )
 
     def joints(self, columns: FloatArray) -> FloatArray:
-        """Joint angles of the robot, rad, (n, k), from the columns (n, k)."""
+        """Joint positions of the robot, rad, (n, k), from the table's columns (n, k), as a copy.
+
+        In this order: columns reordered, times ``angle_scale``, joint 2 added to joint 3 if
+        coupled, signs, quarter turns.
+        """
         turned = columns[:, list(self.order)] * self.angle_scale
         if self.coupled:
             turned[:, 2] += self.coupled * turned[:, 1]
         return turned * np.array(self.signs) + _QUARTER * np.array(self.quarters)
 
     def rates(self, columns: FloatArray | None, scale: float = 1.0) -> FloatArray | None:
-        """Joint speeds or torques of the robot, (n, k), times a scale; None without columns."""
+        """Joint speeds or torques of the robot, (n, k), times a scale; None without columns.
+
+        Order and signs are applied, but neither the coupling of joint 3 nor quarter turns.
+        """
         if columns is None:
             return None
         return scale * columns[:, list(self.order)] * np.array(self.signs)
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Points, m, (n, 3), from those of the table."""
+        """Points, m, (n, 3), of a table's: X and Y exchanged if mirrored, then scaled."""
         return (points[:, [1, 0, 2]] if self.mirrored else points) * self.length_scale
 
 
@@ -153,7 +164,11 @@ class Fitted:
 
     @property
     def gross(self) -> bool:
-        """Whether the table is unlikely to be that of this robot."""
+        """Whether the table is unlikely to be that of this robot.
+
+        True if `worst_error_m` exceeds 5 mm (`UNCALIBRATED_ERROR_M`) or an offset 5 degrees
+        (`LARGEST_OFFSET`; for a joint that slides times ``per_radian``).
+        """
         turned = np.abs(self.joint_offsets) > LARGEST_OFFSET * self.per_radian
         return bool(self.worst_error_m > UNCALIBRATED_ERROR_M or turned.any())
 
@@ -164,7 +179,11 @@ class Fitted:
 
 
 def arranged(session: Session, arrangement: Arrangement) -> Session:
-    """Session with its joints, points, labels and tool rearranged."""
+    """Copy of a session with joints, points, labels, marker positions and tool rearranged.
+
+    Shift and exchanged labels concern only the rows from ``since`` to before ``until``. Rows that
+    a shift leaves without joints are dropped. The checksum of the observations is ''.
+    """
     m = session.measurements
     moved = replace(
         m,
@@ -195,7 +214,11 @@ def arranged(session: Session, arrangement: Arrangement) -> Session:
 
 
 def between(m: Measurements, since: int | None, until: int | None) -> BoolArray:
-    """Mask of the rows from one observation on and before another, (n,)."""
+    """Mask (n,) of the rows from observation ``since`` (inclusive) to ``until`` (exclusive).
+
+    None stands for the first row, or behind the last. Rows are in file order; an observation
+    without a row counts as behind the last row.
+    """
     row = np.arange(len(m))
     first = 0 if since is None else _row_of(m, since)
     last = len(m) if until is None else _row_of(m, until)
@@ -209,7 +232,10 @@ def _row_of(m: Measurements, observation: int) -> int:
 
 
 def exchanged(m: Measurements, a: int, b: int, concerned: BoolArray) -> Measurements:
-    """Measurements with the labels of two markers exchanged in the concerned rows."""
+    """Copy of the measurements with the labels of markers a and b (indices) exchanged.
+
+    ``concerned``: mask of the rows in which labels are exchanged, (n,).
+    """
     marker = m.marker.copy()
     marker[concerned & (m.marker == a)] = b
     marker[concerned & (m.marker == b)] = a
@@ -217,10 +243,10 @@ def exchanged(m: Measurements, a: int, b: int, concerned: BoolArray) -> Measurem
 
 
 def shifted(m: Measurements, shift: int, concerned: BoolArray) -> Measurements:
-    """Measurements with each concerned point next to the joints `shift` rows before.
+    """Measurements with each concerned point next to the joints of the row ``shift`` rows before.
 
-    The rows of each sensor and marker are shifted among themselves; those without joints are left
-    out.
+    ``concerned``: mask, (n,); a negative shift takes joints of rows behind. The concerned rows of
+    each sensor and marker are shifted among themselves; those left without joints are dropped.
     """
     joint_rows, kept = joint_rows_of_points(m, shift, concerned)
     joints: dict[str, Any] = {
@@ -233,7 +259,11 @@ def shifted(m: Measurements, shift: int, concerned: BoolArray) -> Measurements:
 def joint_rows_of_points(
     m: Measurements, shift: int, concerned: BoolArray
 ) -> tuple[IntArray, BoolArray]:
-    """Row whose joints belong to each point, (n,), and mask of the points that have one, (n,)."""
+    """Row whose joints belong to each point, (n,), and mask of the points that have one, (n,).
+
+    Points of rows that are not ``concerned`` keep their own joints. The other rows of each sensor
+    and marker take the joints ``shift`` rows before; the first (last, if negative) have none.
+    """
     joint_rows, kept = np.arange(len(m)), np.ones(len(m), bool)
     for rows in streams(m):
         shifted_rows = rows[concerned[rows]]
@@ -243,17 +273,17 @@ def joint_rows_of_points(
 
 
 def streams(m: Measurements) -> Iterator[IntArray]:
-    """Yield the rows of each pair of sensor and marker, in their order."""
+    """Yield the indices of the rows of each pair of sensor and marker, ascending.
+
+    Pairs come in ascending order of sensor, then marker; only pairs with rows.
+    """
     _, which = np.unique(np.stack((m.sensor, m.marker)), axis=1, return_inverse=True)
     for index in np.unique(which):
         yield np.flatnonzero(which.ravel() == index)
 
 
 def some_rows(session: Session) -> Session:
-    """The optimization rows of a session.
-
-    Evenly spread ones if there are more than `MOST_ROWS`.
-    """
+    """Session with only its optimization rows, at most 200 (`MOST_ROWS`), evenly spread."""
     rows = np.flatnonzero(~session.measurements.is_validation)
     if len(rows) > MOST_ROWS:
         rows = rows[np.linspace(0, len(rows) - 1, MOST_ROWS).astype(np.int64)]
@@ -261,9 +291,10 @@ def some_rows(session: Session) -> Session:
 
 
 def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
-    """Model, parameters (size,) and rows of the best of a few starts.
+    """Model, pinned parameters (size,) and sorted rows of the best of two robust starts.
 
-    Raises InsufficientDataError if there are too few rows or poses to register a sensor.
+    As `closest_start`: whatever its errors, the fit is not refused. Raises InsufficientDataError
+    if there are too few rows or poses to register a sensor.
     """
     model = problem.empty_model()
     start, z = closest_start(
@@ -278,9 +309,10 @@ def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
 
 
 def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
-    """Fit one arrangement robustly, however badly it fits.
+    """Fit one arrangement robustly to at most 200 rows of a session, however badly it fits.
 
-    Raises InsufficientDataError if there are too few rows or poses to register a sensor.
+    ``session``: the table as it is, which is rearranged first. Raises InsufficientDataError if
+    there are too few rows or poses to register a sensor, InputError as `Problem.of`.
     """
     problem = Problem.of(some_rows(arranged(session, arrangement)))
     start, z, rows = closest_fit(problem)
@@ -303,10 +335,11 @@ def fit_arrangement(session: Session, arrangement: Arrangement) -> Fitted:
 def determined_offsets(
     model: Model, z: FloatArray, rows: Rows, priors: Sequence[Prior], sigma: float
 ) -> FloatArray:
-    """Offsets of a fit, rad, (k,); 0 for offsets that the data do not determine.
+    """Zero-offsets of a fit, rad or m, (k,); 0 for offsets that the data do not determine.
 
-    An example is the joint before one that never moves, which turns the marker about it.
-    ``sigma``: standard deviation of the errors per axis, m.
+    That is a standard deviation of 5 degrees (`LARGEST_OFFSET` times ``per_radian``) or more, as
+    of the joint before one that never moves. ``z``: pinned parameters, (size,); ``sigma``:
+    standard deviation of the errors per axis, m.
     """
     derivative = model.jacobian(z, rows).reshape(3 * len(rows), -1) / sigma
     _, by_z = prior_rows(model, priors, z)
@@ -386,15 +419,16 @@ def linear_fit(
 
 
 def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> list[Fitted]:
-    """Arrangements that fit, if the given one is gross, the simplest first.
+    """Fits of arrangements that are not gross, if the given one is wrong, the simplest first.
 
-    Several can fit equally well: an arm with a plane of symmetry, mirrored, is the same arm with
-    some joints reversed. Units, orders, zero positions by quarter turns, a coupling of joint 3 to
-    joint 2, and rows shifted by one are tried, all of them with any signs.
-
-    ``session``: with free markers, since fixed ones at wrong positions would bend the fit;
-    ``given``: fit of the table as it is; ``lengths``: likely length scales, in metres of other
-    units over those of the given one.
+    [] with fewer than 12 rows, if the given fit is right, or if nothing fits. Units, column
+    orders, zero positions by quarter turns, a coupling of joint 3 to joint 2, and rows shifted by
+    one are tried, with any signs. If the given fit is off by over 5 mm, the error must fall to a
+    fifth (`CONVINCING`); if only offsets are whole quarter turns, any fit that is not gross
+    counts. Several can fit equally well: a mirrored symmetric arm is itself with some joints
+    reversed. ``session``: with free markers, since fixed ones at wrong positions would bend the
+    fit; ``given``: fit of the table as it is; ``lengths``: likely length scales, in metres of
+    other units over those of the given one.
     """
     if len(session.measurements) < FEWEST_ROWS:
         return []
@@ -428,7 +462,10 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
 
 
 def closest(found: Sequence[Fitted]) -> list[Fitted]:
-    """Fits with errors near the smallest ones, the simplest first."""
+    """Fits with errors below twice the smallest (`ALIKE`), by number of changes, then error.
+
+    The error is `Fitted.worst_error_m`; [] for no fits.
+    """
     best = min((fit.worst_error_m for fit in found), default=0.0)
     alike = [fit for fit in found if fit.worst_error_m < ALIKE * best]
     return sorted(alike, key=lambda fit: (fit.arrangement.changes, fit.worst_error_m))
@@ -437,9 +474,11 @@ def closest(found: Sequence[Fitted]) -> list[Fitted]:
 def within_limits(
     arrangement: Arrangement, chain: SerialChain, columns: FloatArray
 ) -> Arrangement | None:
-    """Arrangement with whole turns added so that all angles keep the joints' limits.
+    """Arrangement with a whole turn added to joints, so that all angles keep the joints' limits.
 
-    None if there is none: data measured on this arm keep them.
+    None if some joint's angles do not keep them by one turn, nor row by row by up to two turns
+    (`SerialChain.within_turns`). ``columns``: of the table, (n, k); 1 degree beyond a limit is
+    kept.
     """
     q = arrangement.joints(columns)
     low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD
@@ -460,7 +499,11 @@ def within_limits(
 
 
 def keeps_limits(chain: SerialChain, q: FloatArray, joint: int) -> bool:
-    """Whether all angles of a joint, rad, (n,), are within its limits."""
+    """Whether all positions of joint ``joint`` (index from 0) are within its limits.
+
+    ``q``: rad or m, (n,); up to `LIMIT_TOLERANCE_RAD` (1 degree; for a slide that number in m)
+    beyond a limit is allowed.
+    """
     low, high = chain.lower[joint] - LIMIT_TOLERANCE_RAD, chain.upper[joint] + LIMIT_TOLERANCE_RAD
     return bool(np.all((q >= low) & (q <= high)))
 
@@ -468,7 +511,12 @@ def keeps_limits(chain: SerialChain, q: FloatArray, joint: int) -> bool:
 def _nearest(
     chain: SerialChain, session: Session, lengths: Sequence[float]
 ) -> Iterator[Arrangement]:
-    """Yield the arrangements of each kind that come nearest in the linear problem."""
+    """Yield up to six arrangements of each kind (`_stages`), best in the linear problem first.
+
+    Those with errors above 15 % of the points' extent (`_LARGEST_LINEAR`) are left out; of equal
+    errors (three digits) the simplest comes first. The nearest of ``lengths`` is the length scale;
+    if G mirrors, the mirrored arrangement follows its plain one.
+    """
     everywhere = np.ones(len(session.measurements), bool)
     for shift, candidates in _stages(len(chain)):
         m = session.measurements
@@ -487,7 +535,11 @@ def _nearest(
 
 
 def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
-    """Yield the row shift and the arrangements of each kind, with all signs."""
+    """Yield (row shift, arrangements with all 2^k signs) of each kind, for k joints.
+
+    Kinds in order: angle units, column orders, quarter turns, joint 3 coupled to joint 2, and rows
+    shifted by -1 and by 1.
+    """
     plain = Arrangement.given(joints)
     signs = list(product((1, -1), repeat=joints))
     yield 0, [replace(plain, signs=some, angle_scale=by) for by in _SCALES for some in signs]
@@ -500,7 +552,10 @@ def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
 
 
 def _orders(joints: int) -> Iterable[tuple[int, ...]]:
-    """Likely orders of columns: tip to base, any two exchanged, all moved along by one."""
+    """Likely column orders, sorted: tip to base, all moved along by one, any two exchanged.
+
+    Each is a permutation of 0 to joints - 1.
+    """
     plain = list(range(joints))
     orders = {tuple(plain[::-1]), (*plain[1:], 0), (joints - 1, *plain[:-1])}
     for a, b in combinations(plain, 2):
@@ -511,9 +566,9 @@ def _orders(joints: int) -> Iterable[tuple[int, ...]]:
 
 
 def _turns(joints: int) -> Iterable[tuple[int, ...]]:
-    """Zero positions of up to two inner joints, in quarter turns.
+    """Quarter turns of each joint, k numbers, sorted: -1 to 2 of up to two inner joints.
 
-    Those of the outer two joints are absorbed by the registration and the marker.
+    Those of the outer two joints are 0: the registration and the marker absorb them.
     """
     turns = set()
     for pair in combinations(range(1, joints - 1), min(2, max(joints - 2, 0))):

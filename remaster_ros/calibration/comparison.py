@@ -61,7 +61,11 @@ def compared(
 
 
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
-    """Predicted positions of all rows' markers in the sensors' frames, by pinned z, (n, 3)."""
+    """Predicted marker positions of all rows in their sensors' frames N, m, (n, 3).
+
+    In file order of the problem's measurements. ``z``: pinned parameters, (size,). For a sensor on
+    the tool as in `Model.seen`.
+    """
     measurements = problem.measurements
     rows = model.rows(measurements, np.arange(len(measurements))).of_points
     predicted = np.empty((len(measurements), 3))

@@ -44,12 +44,20 @@ def r_hat(draws: FloatArray) -> FloatArray:
 
 
 def ess_bulk(draws: FloatArray) -> FloatArray:
-    """Effective sample size of the centre of the distribution, (...); see `r_hat`."""
+    """Effective number of independent draws for the centre of the distribution, (...).
+
+    ``draws``: (chains, draws, ...); normal scores of all chains' ranks, NaN for a constant
+    quantity. Raises InsufficientDataError with fewer than 8 draws in a chain.
+    """
     return _figures(lambda flat: _effective(_normal_scores(_halves(flat))), draws)
 
 
 def ess_tail(draws: FloatArray) -> FloatArray:
-    """Effective sample size of the tails, (...): the smaller one of the 5 % and 95 % quantiles."""
+    """Effective number of draws in the tails, (...): the smaller of the 5 % and 95 % quantiles.
+
+    ``draws``: (chains, draws, ...); NaN for a constant quantity. Raises InsufficientDataError with
+    fewer than 8 draws in a chain.
+    """
 
     def of(flat: FloatArray) -> FloatArray:
         quantiles = np.quantile(flat, TAILS, axis=(0, 1))
@@ -81,7 +89,10 @@ def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> Float
 
 
 def _halves(draws: FloatArray) -> FloatArray:
-    """Halves of chains (c, n, p) as separate chains, (2 c, n // 2, p)."""
+    """First and last halves of chains (c, n, p) as separate chains, (2 c, n // 2, p).
+
+    The middle draw of an odd number is in neither half.
+    """
     half = draws.shape[1] // 2
     return np.concatenate((draws[:, :half], draws[:, -half:]))
 
@@ -147,7 +158,11 @@ class Diagnostics(NamedTuple):
 
     @classmethod
     def of(cls, run: Chains) -> Diagnostics:
-        """Diagnostics of the draws of a sampler."""
+        """R-hat and effective draws of a sampler's parameters, (p,) each.
+
+        Those that `run` has are taken over, else computed. For draws of the Gaussian about the
+        mode R-hat is NaN and both effective numbers are ``run.effective``.
+        """
         if run.method == 'metropolis':
             draws = run.draws
             return cls(*(run.figures or (r_hat(draws), ess_bulk(draws), ess_tail(draws))))
@@ -183,7 +198,10 @@ class SamplerInfo(Struct, frozen=True):
 
     @property
     def wandering(self) -> bool:
-        """Whether chains disagree, or have too few effective draws to judge."""
+        """Whether Metropolis chains have R-hat above 1.01 or fewer than 400 effective draws.
+
+        False for the Gaussian about the mode ('laplace'), which has no chains.
+        """
         if self.method != 'metropolis':
             return False
         few = self.ess_min is not None and self.ess_min < ESS_LIMIT
@@ -201,9 +219,12 @@ class SamplerInfo(Struct, frozen=True):
         seconds: float | None,
         weakest: str = '',
     ) -> SamplerInfo:
-        """Convergence of the draws of p named parameters; arguments as the attributes.
+        """Convergence of the draws of p named parameters, with a sentence for the report.
 
-        ``weakest`` names the parameters that the observations determine worst together.
+        Converged: every R-hat at most 1.01 and the least effective number of draws at least 1 /
+        ``wanted``², or 400 if ``wanted`` is None. ``names``: of the parameters, p; ``name``: of
+        the sampler; ``weakest``: parameters that the observations determine worst together, which
+        the sentence names for a Gaussian about the mode.
         """
         needed = ESS_LIMIT if wanted is None else wanted**-2
         least = float(np.min(diagnostics[1:]))

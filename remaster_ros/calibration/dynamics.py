@@ -74,14 +74,17 @@ class MotionColumns:
 
     @classmethod
     def of(cls, chain: SerialChain, m: Measurements, offsets: FloatArray) -> MotionColumns:
-        """Functions of the motion of measurements with velocities."""
+        """Functions of the motion of n measurements with velocities; NaN rates count as 0.
+
+        ``offsets``: zero-offsets added to the joints, rad or m, (k,).
+        """
         assert m.velocity is not None
         assert m.acceleration is not None
         rates = np.nan_to_num(m.velocity), np.nan_to_num(m.acceleration)
         return cls(chain, m.q + offsets, *rates, m.stamp_s)
 
     def at(self, rows: IntArray) -> MotionColumns:
-        """Functions of some rows, by their indices."""
+        """Functions of some rows, by their indices; friction is that of the path of all rows."""
         return _PartOfMotion(
             self.chain,
             self.q[rows],
@@ -94,7 +97,7 @@ class MotionColumns:
 
     @cached_property
     def links(self) -> MovingLinks:
-        """Motion of the links."""
+        """Motion of the links, computed once."""
         return MovingLinks.of(self.chain, self.q, self.velocity, self.acceleration)
 
     def jacobian(self, places: FloatArray) -> FloatArray:
@@ -103,9 +106,10 @@ class MotionColumns:
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """Share of each joint's friction, -1 to 1, for the short travel.
+        """Shares of each joint's friction, -1 to 1, (n, k): by the short travel, and its change.
 
-        Last result: its change by the long travel.
+        The second result is the share by the long travel less that by the short one
+        (`TRAVELS_RAD`, times ``per_radian``).
         """
         soon, late = (
             friction_share(self.seconds, self.q, self.velocity, self.acceleration, travel)
@@ -140,7 +144,7 @@ class _PartOfMotion(MotionColumns):
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """Friction of these rows, as computed for all."""
+        """Shares of friction of these rows, as computed along the path of all rows."""
         soon, late = self.whole.friction
         return soon[self.rows], late[self.rows]
 
@@ -276,15 +280,19 @@ def estimate_moving(problem: Problem) -> Estimate:
 
 
 def estimate_beside(moving: Estimate, problem: Problem) -> Estimate:
-    """Estimate without parameters of motion, under the noise that remains with them.
+    """Estimate without parameters of motion, under the path noise of a fit that has them.
 
-    Its errors contain the contributions of motion. ``moving``: of `estimate_moving`.
+    Its errors contain the contributions of motion. ``moving``: of `estimate_moving`; ``problem``:
+    to be fitted. Raises as `estimate`.
     """
     return estimate(replace(problem, path_noise=moving.problem.path_noise))
 
 
 def noise_along_path(found: Estimate) -> PathNoise | None:
-    """Correlations of a fit's errors along the path; None if there are too few frames."""
+    """Correlations of a fit's errors along the path, for all sensors in turn.
+
+    None if no sensor has 40 frames (`FEWEST_FRAMES`); a sensor with fewer has no correlations.
+    """
     posterior, model, mode = found.posterior, found.model, found.mode
     rows, free = posterior.rows.of_points, posterior.free
     errors = rows.target - model.predict(mode.z, rows)
@@ -312,7 +320,7 @@ def noise_along_path(found: Estimate) -> PathNoise | None:
 
 
 def moving_words(found: Estimate) -> str:
-    """Sentence with the remaining errors and the offsets of the clocks."""
+    """Sentence with the median remaining error, mm, and the delay of each sensor's stamps."""
     posterior = found.posterior
     errors = posterior.rows.target - found.model.predict(found.mode.z, posterior.rows)
     length = 1e3 * float(np.median(np.linalg.norm(errors[: posterior.rows.points], axis=1)))
@@ -347,6 +355,6 @@ def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
 
 
 def late_words(late_s: float, std_s: float) -> str:
-    """Delay of stamps and its standard deviation as text: '9.97 ± 0.12 ms late' or '… early'."""
+    """Delay and its std as text in ms: '9.97 ± 0.12 ms late'; 'early' if negative."""
     what = 'late' if late_s >= 0.0 else 'early'
     return f'{1e3 * abs(late_s):.2f} ± {1e3 * std_s:.2f} ms {what}'

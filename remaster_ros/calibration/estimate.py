@@ -74,17 +74,19 @@ class Problem:
 
     @classmethod
     def of(cls, session: Session, priors: Priors | None = None) -> Problem:
-        """Reduce and check a session.
+        """Reduce a session to its sensors and markers with rows, and check it.
 
-        ``priors`` replace its own ones of the same markers and sensors.
+        ``priors`` are prior knowledge besides the session's own; of the same marker or sensor they
+        replace the session's.
 
         Raises
         ------
         InputError
-            A robot that does not fit the session, or priors on things that the session does not
-            have.
+            The URDF has another number of joints than the session, or a prior names a joint,
+            marker or sensor that the session does not have, or has the wrong unit for its joint.
         InsufficientDataError
-            Too few observations, of one sensor or of all.
+            The robot has one joint, there are no optimization rows, or a sensor has fewer than
+            3 poses or 4 optimization rows.
         """
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         given = session.measurements
@@ -156,14 +158,14 @@ class Problem:
         )
 
     def marker_priors(self, model: Model) -> tuple[Prior, ...]:
-        """Priors on the markers."""
+        """Priors on the positions of all markers, in index order."""
         return tuple(
             marker_prior(model, index, self.markers[index], float(self.marker_std_m[index]))
             for index in range(len(self.markers))
         )
 
     def other_priors(self, model: Model) -> tuple[Prior, ...]:
-        """Priors on registrations and offsets."""
+        """Priors on registrations and offsets: only those that session or priors file state."""
         base = tuple(
             base_prior(model, index, self.priors.base[name])
             for index, name in enumerate(self.sensor_names)
@@ -175,7 +177,11 @@ class Problem:
         )
 
     def plausibility(self, model: Model, free: IntArray) -> tuple[Prior, ...]:
-        """Wide prior on the free offsets without another prior; () if there are none."""
+        """Wide prior (5 degrees, `plausible_offsets`) on free offsets without a stated prior.
+
+        One `Prior` for all of them, or () if there are none. ``free``: indices of parameters, of
+        which those below k are joints.
+        """
         unknown = [
             joint
             for joint, name in enumerate(self.chain.joint_names)
@@ -184,7 +190,7 @@ class Problem:
         return (plausible_offsets(model, unknown),) if unknown else ()
 
     def empty_model(self, extension: Extension | None = None) -> Model:
-        """Model with unknown registrations."""
+        """Model with reference registrations at identity, and an extension if one is given."""
         count = len(self.sensor_names)
         return Model(
             self.chain,
@@ -223,23 +229,27 @@ class Estimate:
 
     @cached_property
     def before(self) -> Mode:
-        """Mode with all offsets at zero, registrations and markers fitted.
+        """Mode with all offsets at zero, registrations and markers fitted to the same rows.
 
-        Errors as of `find_mode`.
+        Raises InsufficientDataError if the search does not settle (`find_mode`).
         """
         return mode_at_offsets(self.mode, np.zeros(self.model.joints))
 
 
 @one_thread
 def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
-    """Find the mode, with the parameters of an extension if one is given.
+    """Mode of a problem's posterior, with the parameters of an extension if one is given.
+
+    Gross errors are left out. If orientations are measured and do not fit, the positions alone are
+    fitted, and ``without_turns`` has the reason.
 
     Raises
     ------
     InsufficientDataError
         The data do not determine the parameters.
     MisfitError
-        The data disagree with the model altogether.
+        The data disagree with the model altogether: errors above a tenth of the points' extent,
+        mirrored points, or more than a tenth of a sensor's rows gross.
     """
     measurements = problem.measurements
     empty = problem.empty_model(extension)
@@ -269,7 +279,12 @@ def estimate(problem: Problem, extension: Extension | None = None) -> Estimate:
 
 
 def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | None) -> Estimate:
-    """Find the mode from a solution near it; errors as of `estimate`."""
+    """Mode from a solution z (size,) near it, without gross errors.
+
+    ``start``: given solution whose gross rows are left out at first; None without one. ``z`` is
+    changed in place: joints held by the gauge are set to 0. Raises InsufficientDataError and
+    MisfitError as `estimate`.
+    """
     measurements = problem.measurements
     priors = problem.marker_priors(model) + problem.other_priors(model)
     rows = model.rows(measurements, problem.fitted)
@@ -322,7 +337,10 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
 
 
 def of_positions_alone(found: Estimate) -> Estimate:
-    """Estimate by the positions only, for models without orientations."""
+    """Estimate by the positions only; the same estimate if it fits no orientations.
+
+    The extension, if any, is not fitted again. Raises as `estimate`.
+    """
     if not found.model.bodies:
         return found
     session = found.problem.session.positions_alone()
@@ -331,10 +349,11 @@ def of_positions_alone(found: Estimate) -> Estimate:
 
 
 def stating_directions(measurements: Measurements, rows: IntArray) -> list[int]:
-    """Sensors whose samples scatter differently along the line of sight and across it.
+    """Sensors (indices) whose samples scatter differently along the line of sight and across it.
 
-    In the sensor's frame each axis has the variance across, plus its share of the difference along
-    the line. The scatter of samples shows it with fewer readings than their means.
+    Regression of the samples' variance on the share of each axis in the line of sight, tested at 1
+    in 1,000; sensors with fewer than 4 readings of several samples are left out. ``rows``: indices
+    of the measurements that count.
     """
     found = []
     for sensor in np.unique(measurements.sensor[rows]).tolist():
@@ -365,8 +384,8 @@ def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
     """Mode with a separate noise along the line of sight for each sensor that shows one.
 
     One sensor after the other, by a likelihood-ratio test of the noise with the parameters
-    integrated out. Its error rate is 1 in 1,000, less if a pose_sigma is zero. ``stating``:
-    sensors whose readings state it themselves.
+    integrated out. Its error rate is 1 in 1,000, less if a pose_sigma is zero. The same mode if no
+    sensor does. ``stating``: sensors that have one without a test, as their samples show it.
     """
     posterior = mode.linearisation.posterior
     split: list[int] = []
@@ -389,7 +408,8 @@ def with_directions(mode: Mode, stating: Sequence[int] = ()) -> Mode:
 def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
     """Mode of the same posterior with the joint offsets fixed at given values.
 
-    ``mode``: of the fit with free offsets; ``joint_offsets``: rad, (k,).
+    ``mode``: of the fit with free offsets; ``joint_offsets``: rad or m, (k,). Raises
+    InsufficientDataError if the search does not settle (`find_mode`).
     """
     posterior = mode.linearisation.posterior
     joints = posterior.model.joints
@@ -406,8 +426,9 @@ def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
     """Gauge found again at the mode if an offset is badly determined, else the given gauge.
 
-    The given gauge was found at the start, which may lie far from the mode along such a direction.
-    It is kept if the new one would hold other parameters.
+    Badly: a standard deviation above 0.2 degrees (`WEAK_ANGLE`) without a reason in the gauge. The
+    given gauge was found at the start, which may lie far from the mode along such a direction. It
+    is kept if the new one would hold other parameters.
     """
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))
@@ -423,7 +444,10 @@ def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
 
 
 def _require_information(count: int, free: IntArray, model: Model) -> None:
-    """Raise InsufficientDataError for fewer coordinates than unknowns."""
+    """Raise InsufficientDataError if 3 ``count`` coordinates are fewer than the unknowns.
+
+    These are the free offsets and registrations (``free``: indices), and 3 for a marker.
+    """
     needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
     if 3 * count < needed:
         raise InsufficientDataError(
@@ -433,7 +457,10 @@ def _require_information(count: int, free: IntArray, model: Model) -> None:
 
 
 def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
-    """Sentence since when sensors with too many gross errors are off; '' if nothing shows it."""
+    """Sentence since when sensors with too many gross errors are off, with '; ' before each.
+
+    '' if no sensor shows a step (`moved_since`). ``errors``: measured minus modelled, m, (n, 3).
+    """
     text = ''
     for sensor, span in rows.of_points.spans:
         moved = moved_since(problem.measurements, rows.source[span], errors[span])

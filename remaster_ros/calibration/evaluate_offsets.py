@@ -112,7 +112,11 @@ def accuracy_with_offsets(
 def _draws(
     found: Estimate, given: Mode, joint_offsets_std: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Draws of offsets, and of registrations and markers given them, pinned, (draws, size)."""
+    """Draws of offsets, and of registrations and markers given them, pinned, (2000, size).
+
+    Offsets of the inner joints are independent Gaussians about ``given`` with the stds, rad or m,
+    (k,); the others follow from the linearised posterior at ``given``.
+    """
     model = found.model
     joints = np.arange(1, model.joints - 1)
     # In pinned coordinates the outer two joints move nothing.

@@ -69,9 +69,10 @@ class Extension:
     of_motion: bool = False  # What every fit of a moving session has (`dynamics`): no causes
 
     def with_motion(self, other: Extension | None) -> Extension:
-        """Return these parameters and behind them those of motion, if another extension has any.
+        """These parameters and behind them those of motion of another extension.
 
-        That has to be linearised at 0, as parameters of motion are.
+        The same extension if ``other`` is None or has no parameters of motion (``of_motion``). The
+        other has to be linearised at 0, as parameters of motion are.
         """
         if other is None or not other.of_motion:
             return self
@@ -93,7 +94,10 @@ class Extension:
         )
 
     def turns(self, theta: FloatArray, rows: IntArray) -> dict[int, FloatArray]:
-        """Angles added by theta (..., m) in n rows: joint -> rad, (..., n)."""
+        """Angles that theta (..., m) adds in n rows: joint index -> rad (m for a slide), (..., n).
+
+        ``rows``: indices of the measurements, (n,). Joints without an effect have no key.
+        """
         added: dict[int, FloatArray] = {}
         for term in self.terms:
             if term.at is not None:
@@ -102,7 +106,10 @@ class Extension:
         return added
 
     def shifts(self, theta: FloatArray, rows: IntArray) -> FloatArray:
-        """Displacements of n rows by theta (..., m), in R, m, (..., n, 3)."""
+        """Displacements of n rows by theta (..., m), in base coordinates R, m, (..., n, 3).
+
+        ``displacement0`` is included. ``rows``: indices of the measurements, (n,).
+        """
         step = theta - self.theta0
         shift = np.zeros((*theta.shape[:-1], len(rows), 3))
         for term in self.terms:

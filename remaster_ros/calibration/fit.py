@@ -152,7 +152,11 @@ def _fast(
     rng: np.random.Generator,
     report: Progress,
 ) -> Sampled:
-    """Sampled posterior by the Metropolis sampler."""
+    """Posterior of an estimate, sampled by independence Metropolis (`sample_posterior`).
+
+    ``draws``: per chain, None for as many as the precision takes. Raises InsufficientDataError if
+    the posterior cannot be factored.
+    """
     posterior, model = found.posterior, found.model
 
     def columns(points: FloatArray) -> FloatArray:

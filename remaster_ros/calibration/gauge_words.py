@@ -27,7 +27,11 @@ def counted(number: int, what: str) -> str:
 
 
 def in_words(model: Model, direction: FloatArray) -> str:
-    """Sentence on parameters that change together without effect, and how to separate them."""
+    """Sentence on parameters that change together without effect, and how to separate them.
+
+    ``direction``: change of each parameter, rad and m, (size,), 0 for those that do not change;
+    joint 1 with registrations, and the last joint with markers or bodies, are named as such.
+    """
     joints = np.flatnonzero(direction[: model.joints])
     sensors = [
         index
@@ -105,7 +109,7 @@ def in_words(model: Model, direction: FloatArray) -> str:
 
 
 def combination_text(model: Model, direction: FloatArray) -> str:
-    """Parameters of a direction with their shares, as text."""
+    """Parameters of a direction (size,) that are not 0, with their values, as text."""
     moved = [
         f'{name} ({value:+.3g})'
         for name, value in zip(model.names, direction, strict=True)
@@ -115,7 +119,7 @@ def combination_text(model: Model, direction: FloatArray) -> str:
 
 
 def _shortened(parts: Sequence[str]) -> str:
-    """Parts joined by commas; of very many, some and the number of the others."""
+    """Parts as a list in words; of more than 20 (`MOST_LISTED`) the first 5 and 'n more'."""
     if len(parts) > MOST_LISTED:
         others = len(parts) - MOST_NAMED
         return listed([*parts[:MOST_NAMED], f'{others} more'])
@@ -141,7 +145,11 @@ def in_a_line(why: str) -> str:
 
 
 def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
-    """Parameters with the largest loadings (f,) of a direction, with their shares, as text."""
+    """Parameters with the largest loadings (f,) of a direction, with their shares, as text.
+
+    At most 5, with loadings above a fifth of the largest, largest first; shares are relative to
+    it. A single one is its name alone. ``names``: of the parameters, f.
+    """
     size = np.abs(loadings) / np.max(np.abs(loadings))
     order = [index for index in np.argsort(-size)[:MOST_NAMED] if size[index] > LEAST_SHARE]
     if len(order) == 1:
@@ -159,7 +167,7 @@ def the(kind: str, name: str) -> str:
 
 
 def listed(parts: Sequence[str]) -> str:
-    """Parts joined by commas and an `and`."""
+    """Text such as 'a', 'a and b', 'a, b and c'; '' without parts."""
     if len(parts) < 2:
         return ''.join(parts)
     return f'{", ".join(parts[:-1])} and {parts[-1]}'
@@ -168,7 +176,11 @@ def listed(parts: Sequence[str]) -> str:
 def resolving_priors(
     priors: Sequence[Prior], x: FloatArray, directions: FloatArray, model: Model
 ) -> list[str]:
-    """Descriptions of the priors that fix each of d directions (size, d)."""
+    """Descriptions of the priors that fix each of d directions (size, d), one text each.
+
+    Priors with at least a thousandth of the strongest pull along the direction; that of the
+    extension's parameters is `EFFECTS_PRIOR`. ``x``: natural parameters, (size,).
+    """
     core = replace(model, extension=None)
     names = [*(prior.description for prior in priors), EFFECTS_PRIOR]
     rows = [prior_rows(core, [prior], x[: model.core], natural=True)[1] for prior in priors]

@@ -31,7 +31,11 @@ NEGLIGIBLE = 1e-14
 
 
 def spent(share: FloatArray, error_rate: float) -> FloatArray:
-    """Part of the error rate that may be spent after shares (n,) of all data, above 0 to 1."""
+    """Part of the error rate that may be spent after shares (n,) of all data, (n,).
+
+    2 - 2 Φ(z / √share), z being the upper quantile at half of the error rate; shares are above 0
+    and at most 1, where all of it is spent.
+    """
     z = scipy.special.ndtri(0.5 * error_rate)
     found: FloatArray = 2.0 * scipy.special.ndtr(z / np.sqrt(share))
     return found

@@ -64,7 +64,11 @@ class Rows:
 
     @classmethod
     def of(cls, measurements: Measurements, rows: IntArray, reference: FloatArray) -> Rows:
-        """Sort the given rows of the measurements; `reference` is T_R_N, (sensors, 4, 4)."""
+        """Positions of some rows of the measurements, sorted by sensor, pose and frame.
+
+        ``rows``: indices of the measurements, in any order; ``reference``: T_R_N, (sensors, 4, 4),
+        by which targets are converted to base coordinates.
+        """
         keys = [rows, measurements.pose[rows], measurements.sensor[rows]]
         if measurements.frame is not None:
             keys.insert(1, measurements.frame[rows])
@@ -104,9 +108,10 @@ class Rows:
         bodies: Bodies,
         on_tool: Sequence[int] = (),
     ) -> Rows:
-        """Sort as `of`, with the orientations of bodies after the positions.
+        """Positions as of `of`, and behind them the orientations of bodies, where they are finite.
 
-        ``on_tool`` are sensors on the tool: see ``lever``.
+        ``on_tool`` are indices of sensors on the tool: see ``lever``. The same as `of` without
+        bodies or measured orientations.
         """
         points = cls.of(measurements, rows, reference)
         if not bodies or measurements.orientation is None:
@@ -160,7 +165,7 @@ class Rows:
         )
 
     def along_path(self, noise: PathNoise | None) -> Rows:
-        """Return these rows with errors that are correlated along the path; as are without."""
+        """These rows with errors correlated along the path; the same rows if noise is None."""
         if noise is None:
             return self
         found = []
@@ -180,7 +185,10 @@ class Rows:
         return replace(self, decorrelation=tuple(found))
 
     def decorrelated(self, values: FloatArray) -> FloatArray:
-        """Return vectors (n, 3, ...) of which errors along the path are independent."""
+        """Vectors (n, 3, ...) multiplied so that errors along the path are independent.
+
+        The values themselves, no copy, if there is no correlation.
+        """
         if not self.decorrelation:
             return values
         flat = values.reshape(len(self), -1)
@@ -210,14 +218,17 @@ class Rows:
         return self.target if self.place is None else self.place
 
     def whole(self, rows: BoolArray) -> BoolArray:
-        """Mask of rows, extended to both halves (position and orientation) of each reading."""
+        """Mask (n,) extended to both halves (position and orientation) of each reading.
+
+        The same mask if no orientations are fitted.
+        """
         if self.turned is None:
             return rows
         return np.asarray(np.isin(self.source, self.source[rows]))
 
     @property
     def of_points(self) -> Rows:
-        """Rows of the positions only."""
+        """Rows of the positions only, which are the first; the same rows without orientations."""
         if self.turned is None:
             return self
         count = int(np.searchsorted(self.group_start, self.points))
@@ -228,7 +239,10 @@ class Rows:
         return _sum(self._rows_of_groups, values)
 
     def blocks(self, rows: int) -> list[tuple[int, int]]:
-        """Runs of groups (first, end) of about `rows` rows each."""
+        """Runs of groups (first, end), end exclusive, of about ``rows`` rows each.
+
+        No group is split, so that a run is longer if a group is.
+        """
         number = self.group_start // max(1, rows)
         edges = np.flatnonzero(np.diff(number)) + 1
         cuts = [0, *edges.tolist(), len(self.group_start)]
@@ -258,7 +272,10 @@ class Rows:
         )
 
     def picked(self, rows: slice | IntArray) -> Rows:
-        """Columns of some rows; the grouping is left to the caller, without decorrelation."""
+        """Copy with the columns of some rows (slice or indices), without decorrelation.
+
+        Groups, spans and measured orientations remain those of all rows: the caller replaces them.
+        """
         names = ('source', 'q', 'marker', 'target', 'frame', 'body', 'lever', 'place')
         columns: dict[str, Any] = {
             name: value[rows] for name in names if (value := getattr(self, name)) is not None
@@ -314,6 +331,7 @@ class Rows:
 
     @cached_property
     def _rows_of_groups(self) -> csr_array:
+        """Indicator matrix (groups, n) with 1 for each row of a group."""
         return _members(self.group_start, len(self))
 
     @cached_property
@@ -328,13 +346,19 @@ class Rows:
 
 
 def _members(start: IntArray, count: int) -> csr_array:
-    """Indicator matrix of consecutive runs, (runs, count), from their first indices."""
+    """Indicator matrix (runs, count) of consecutive runs of ``count`` elements.
+
+    ``start``: first index of each run, ascending from 0, (runs,).
+    """
     edges = np.append(start, count)
     return csr_array((np.ones(count, np.int8), np.arange(count), edges), (len(start), count))
 
 
 def _sum(members: csr_array, values: FloatArray) -> FloatArray:
-    """Sums of runs of values; the values themselves if each is a run."""
+    """Sums of runs of values, (runs, ...), from values (n, ...).
+
+    ``members``: of `_members`, (runs, n). The values themselves, no copy, if each is a run.
+    """
     if members.shape[0] == members.shape[1]:
         return values
     # A tenth of the time of `np.add.reduceat`.

@@ -154,7 +154,7 @@ def known_offsets(
 
 
 def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
-    """Parameters of a direction that are not zero, by name."""
+    """Parameters of a direction (size,) that are not zero: name -> value, to 9 decimals."""
     return {
         name: round(float(value), 9)
         for name, value in zip(model.names, combination, strict=True)
@@ -165,7 +165,11 @@ def _entries(model: Model, combination: FloatArray) -> dict[str, float]:
 def _badly_determined(
     model: Model, direction: FloatArray, joint: int, std: float, scale: FloatArray
 ) -> GaugeDirection:
-    """Gauge direction along which a joint's offset has a large ``std``, rad or m."""
+    """Gauge direction along which a joint's offset has a large ``std``, rad or m.
+
+    ``joint``: index from 0; ``scale``: root of the information on each parameter alone, (size,);
+    in its units the direction's parts below a tenth of its largest (`WEAK_SHARE`) are left out.
+    """
     size = np.abs(direction * scale)
     main = np.where(size > WEAK_SHARE * size.max(), direction, 0.0)
     main[joint] = direction[joint]
@@ -270,7 +274,11 @@ def _nearly_null(
 
 
 def _angles(model: Model) -> BoolArray:
-    """Mask of the parameters that are angles, (size,); effects are not."""
+    """Mask of the parameters that count as angles, (size,): offsets and rotations.
+
+    Zeros of joints that slide, and rotations of sensors and bodies, are among them; effects are
+    not.
+    """
     angles = np.arange(model.size) < model.joints
     for sensor in range(len(model.sensor_names)):
         angles[model.registration(sensor)][3:] = True
@@ -366,7 +374,11 @@ def _standard_deviations(by_direction: FloatArray) -> FloatArray:
 
 
 def _about_origin(model: Model, direction: FloatArray, scale: FloatArray) -> FloatArray:
-    """Corrections about the centroids converted to corrections about the origin of R, scaled."""
+    """Direction (size,) with registrations about the origin of R in place of the centroids.
+
+    Entries below 1e-5 of the largest (`NEGLIGIBLE`; at first in units of ``scale``) are set to 0;
+    if an entry exceeds 1, the largest is scaled to 1.
+    """
     size = np.abs(direction * scale)
     moved = np.where(size > NEGLIGIBLE * size.max(), direction, 0.0)
     for sensor, centroid in enumerate(model.centroid):

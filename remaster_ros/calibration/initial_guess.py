@@ -70,7 +70,10 @@ def robust_start(
 def given_start(
     model: Model, measurements: Measurements, rows: IntArray, start: Start
 ) -> tuple[Model, FloatArray]:
-    """Model with its reference registrations at a known solution, and z there."""
+    """Model with its reference registrations at a known solution, and pinned z there, (size,).
+
+    ``rows``: indices of the measurements to fit, about whose median the corrections turn.
+    """
     moved = referenced(model, measurements, rows, start.T_R_N)
     return moved, moved.pinned(moved.vector(start.joint_offsets, start.markers))
 
@@ -83,9 +86,11 @@ def closest_start(
     marker_std_m: float,
     priors: Sequence[Prior],
 ) -> tuple[Model, FloatArray]:
-    """Closest solution, however far the data are from the robot.
+    """Solution with the smaller errors of two starts, however far the data are from the robot.
 
-    Arguments as of `robust_start`.
+    Starts: markers at nominal, and markers by `_linear_markers`. Arguments and results as of
+    `robust_start`, but z has registrations off the reference. Raises InsufficientDataError if a
+    sensor's points do not fix a registration; never MisfitError.
     """
     chain = model.chain
     tool = chain.forward(measurements.q[rows])
@@ -169,7 +174,7 @@ def _median_rotation(turns: Rotation) -> tuple[FloatArray, float]:
 
 
 def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:
-    """Rows, evenly spread for a sensor with more than `LARGEST_START`."""
+    """Indices of rows, ascending; evenly spread ones of a sensor with more than 5,000."""
     chosen = []
     for sensor in np.unique(measurements.sensor[rows]):
         sensor_rows = rows[measurements.sensor[rows] == sensor]
@@ -179,7 +184,11 @@ def _some_rows(measurements: Measurements, rows: IntArray) -> IntArray:
 
 
 def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatArray:
-    """T_R_N of one sensor from pairs of points. Raises InsufficientDataError with its name."""
+    """T_R_N (4, 4) of one sensor by least squares from pairs of points, m, (n, 3) each.
+
+    ``sensor``: its name, for the message. Raises InsufficientDataError for fewer than three
+    points, or points on a line.
+    """
     try:
         return register_points(points_R, points_N)[0]
     except InsufficientDataError as error:
@@ -189,7 +198,10 @@ def register(points_R: FloatArray, points_N: FloatArray, sensor: str) -> FloatAr
 def referenced(
     model: Model, measurements: Measurements, rows: IntArray, reference: FloatArray
 ) -> Model:
-    """Model with these registrations as reference, centred on each sensor's data."""
+    """Copy of the model with registrations T_R_N (sensors, 4, 4) as reference.
+
+    Each is centred on the median of its sensor's positions in ``rows`` (indices).
+    """
     centroid = []
     for index, T_R_N in enumerate(reference):
         sensor_rows = rows[measurements.sensor[rows] == index]
@@ -198,7 +210,11 @@ def referenced(
 
 
 def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None:
-    """Raise MisfitError for points that agree with the robot only when mirrored."""
+    """Raise MisfitError if a sensor's points agree with the robot only when mirrored.
+
+    That is if they are off by over 3 % of their extent, and mirrored by under 30 % of that.
+    ``predicted``: in the coordinates of `Rows.target`, m, (n, 3).
+    """
     for sensor, span in rows.spans:
         measured, modelled = rows.target[span], predicted[span]
         measured, modelled = measured - measured.mean(axis=0), modelled - modelled.mean(axis=0)
@@ -219,7 +235,10 @@ def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None
 
 
 def _require_likeness(model: Model, rows: Rows, errors: FloatArray) -> None:
-    """Raise MisfitError for data that do not fit the robot: wrong units, joints or markers."""
+    """Raise MisfitError if a sensor's robust error exceeds a tenth of its points' extent.
+
+    Causes: wrong units, joints or markers. ``errors``: measured minus modelled, m, (n, 3).
+    """
     spread = robust_spread(errors, rows)
     for error, (sensor, span) in zip(spread, rows.spans, strict=True):
         extent = np.median(np.linalg.norm(rows.target[span] - model.centroid[sensor], axis=1))
@@ -245,11 +264,12 @@ def _linear_markers(
     nominal: FloatArray,
     marker_std_m: float,
 ) -> FloatArray:
-    """Estimate marker positions without any registration.
+    """Marker positions in the tool frame, m, (markers, 3), without any registration.
 
     With any 3×3 matrix G in the place of the sensor's rotation, tool · marker = G p + t is linear
     in marker, G and t together: one least-squares problem without a start. Rows that disagree lose
-    their weight in a few repetitions.
+    their weight in six repetitions. ``tool``: T_R_T, (n, 4, 4); ``sensor, marker``: indices, (n,);
+    ``measured``: m, (n, 3); ``nominal``: positions, m, with ``marker_std_m`` per axis.
     """
     sensors, markers = int(sensor.max()) + 1, len(nominal)
     design = np.zeros((len(measured), 3, 12 * sensors + 3 * markers))
@@ -326,13 +346,20 @@ def _squares(errors: FloatArray) -> FloatArray:
 
 
 def robust_spread(errors: FloatArray, rows: Rows) -> FloatArray:
-    """Robust standard deviation per axis of each sensor's errors, m, (sensors,)."""
+    """Robust standard deviation per axis of each sensor's errors, m, in order of ``rows.spans``.
+
+    The median length over 1.538 (`MEDIAN_LENGTH`), plus 0.1 µm (`RESOLUTION_M`). ``errors``: m,
+    (n, 3); of orientations rad.
+    """
     length = np.sqrt(_squares(errors))
     return np.array([np.median(length[s]) / MEDIAN_LENGTH + RESOLUTION_M for _, s in rows.spans])
 
 
 def _cost(errors: FloatArray, scale: FloatArray, prior_residual: FloatArray) -> float:
-    """Cauchy cost of errors plus the prior's cost."""
+    """Cauchy cost of errors (n, 3), plus half the sum of squares of the priors' residuals (m,).
+
+    ``scale``: robust standard deviation of each row's errors, (n,).
+    """
     width = CAUCHY_WIDTH**2
     data = 0.5 * width * np.sum(np.log1p(_squares(errors) / (width * scale**2)))
     return float(data + 0.5 * prior_residual @ prior_residual)

@@ -82,13 +82,17 @@ class Mode:
 
     @property
     def log_evidence(self) -> float:
-        """Log likelihood of the noise at the mode, with the parameters integrated out."""
+        """Log likelihood of the noise at the mode, with the parameters integrated out.
+
+        Without the prior of the noise, and up to a constant: only differences between noise models
+        on the same rows have a meaning.
+        """
         marginal = self.linearisation.whitened(self.eta)[2]
         return float(marginal - self.linearisation.posterior.log_noise_prior(self.eta))
 
     @property
     def weakest(self) -> str:
-        """Names of the parameters that are determined worst together, without effects.
+        """Names of the parameters that are determined worst together, without effects, as text.
 
         A curve of a joint always has a coefficient that only its smoothness prior determines.
         """
@@ -286,7 +290,11 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
-    """Covariance of the noise by curvature; for a shared part near zero by its spread."""
+    """Covariance of the noise's coordinates, (e, e), by the curvature at the peak.
+
+    A shared part within two standard deviations of zero has the mean square of its deviations by
+    quadrature instead, and no correlations.
+    """
     precision = _noise_curvature(linearisation, peak)
     count = len(linearisation.posterior.noise_model.channels)
     std = 1.0 / np.sqrt(np.maximum(np.diag(precision), 0.45))
@@ -331,7 +339,7 @@ def _noise_slope(
 
 
 def _noise_curvature(linearisation: Linearisation, at: FloatArray) -> FloatArray:
-    """Negative second derivative of the noise's log density.
+    """Negative second derivative of the noise's log density at ``at``, (e, e), symmetric.
 
     By differences of its gradient, which needs one factorisation for dozens of the density's.
     """
@@ -346,9 +354,10 @@ def _noise_curvature(linearisation: Linearisation, at: FloatArray) -> FloatArray
 def _curvature(
     density: Callable[[FloatArray], FloatArray], at: FloatArray
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Log density, gradient and negative second derivative by differences.
+    """Log density, gradient (e,) and negative second derivative (e, e) at ``at``, by differences.
 
-    All points in one batch: the density costs microseconds, its analytic derivative a page.
+    ``density``: of points (n, e) to (n,). All points in one batch: the density costs microseconds,
+    its analytic derivative a page.
     """
     e, step = len(at), DIFFERENCE
     unit = step * np.eye(e)

@@ -53,7 +53,10 @@ class Contrasts:
 
     @classmethod
     def of(cls, rows: Rows, measurements: Measurements, white: FloatArray) -> Contrasts:
-        """Contrasts of the rows' [derivative | error] in units of the noise, (n, 3, f + 1)."""
+        """Contrasts of the rows' [derivative | error] in units of the noise.
+
+        ``white``: (n, 3, f + 1), the error last; ``rows``: the same n rows, grouped by pose.
+        """
         formed = np.empty_like(white)
         for size in np.unique(rows.group_size).tolist():
             at = rows.group_start[rows.group_size == size][:, None] + np.arange(size)
@@ -63,7 +66,7 @@ class Contrasts:
         return cls(measurements.pose[rows.source], kind, formed[..., :-1], formed[..., -1])
 
     def gram(self, kind: int) -> FloatArray:
-        """Gram matrix of [derivative | error] of one kind, (f + 1, f + 1)."""
+        """Gram matrix of [derivative | error] of one ``kind``, (f + 1, f + 1)."""
         of_kind = self.kind == kind
         both = np.concatenate((self.derivative[of_kind], self.errors[of_kind][..., None]), axis=2)
         flat = both.reshape(-1, both.shape[2])
@@ -71,7 +74,11 @@ class Contrasts:
         return gram
 
     def distances(self, kind: int, covariance: FloatArray) -> Iterator[float]:
-        """Yield the squared distance per number of each pose that was not fitted."""
+        """Yield the squared distance per number of each pose of one kind that was not fitted.
+
+        Mahalanobis distance of its errors over their number, by I + X Σ X'; ``covariance``: Σ of
+        the parameters in units of the noise, (f, f).
+        """
         for pose in np.unique(self.pose[self.kind == kind]):
             of_pose = (self.kind == kind) & (self.pose == pose)
             X, e = (
@@ -114,7 +121,11 @@ def compared(
 
 
 def _p_value_larger(found: FloatArray, expected: FloatArray) -> float:
-    """Probability by chance that numbers (n,) rank as high among others (m,)."""
+    """Probability by chance that numbers (n,) rank as high among others (m,), one-sided.
+
+    Mann and Whitney's test: exact if either has at most 8 (`FEW`), else by a normal distribution
+    with continuity correction.
+    """
     n, m = len(found), len(expected)
     larger = int(np.searchsorted(np.sort(expected), found).sum())
     if min(n, m) <= FEW:
@@ -142,7 +153,11 @@ def _share_of_orders(n: int, m: int, larger: int) -> float:
 
 
 def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, FloatArray]:
-    """Squared distances of poses left out in turn, in units of the noise without them, by kind."""
+    """Squared distances per number of poses left out in turn, by kind, (poses of the kind,) each.
+
+    In units of the noise without the pose. At most 1,000 poses, evenly spread; poses that alone
+    determine a direction are skipped. ``covariance``: of the parameters, (f, f).
+    """
     kinds = np.unique(fitted.kind).tolist()
     f = len(covariance)
     distances: dict[int, list[float]] = {kind: [] for kind in kinds}
@@ -192,8 +207,9 @@ def held_out_tests(
 ) -> tuple[StructureTest, ...]:
     """Test for each sensor of a fit whether held-out poses are predicted worse.
 
-    ``mode``: of the posterior of the fitted rows; ``measurements``: all rows; ``gross``:
-    ``observation`` of each held-out row that is a gross error.
+    Separate tests for means of poses and for deviations; () without held-out rows or if all noise
+    is below 1 µm. ``mode``: of the posterior of the fitted rows; ``measurements``: all rows;
+    ``gross``: ``observation`` of each held-out row that is a gross error.
     """
     posterior = mode.linearisation.posterior
     kept = measurements.is_validation & ~np.isin(measurements.observation, gross)
@@ -211,7 +227,7 @@ def held_out_tests(
 
 
 def _contrasts(mode: Mode, measurements: Measurements, rows: Rows) -> Contrasts:
-    """Contrasts of rows at a mode."""
+    """Contrasts of rows, (n,), at a mode, in units of its noise."""
     white = whitened(mode, rows, {})
     joined = np.concatenate((white['model'], white['errors']), axis=2)
     return Contrasts.of(rows, measurements, joined)

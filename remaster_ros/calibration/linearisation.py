@@ -47,7 +47,10 @@ class Linearisation:
     prior: FloatArray  # Gram matrix of the priors, (f+1, f+1)
 
     def gram(self, eta: FloatArray) -> FloatArray:
-        """Weighted Gram matrices (..., f+1, f+1) for noise coordinates (..., e)."""
+        """Gram matrices of [derivative | error], (..., f+1, f+1), for noise coordinates (..., e).
+
+        Each error group is divided by its variance, and the priors' matrix is added.
+        """
         return np.tensordot(1.0 / self.posterior.variances(eta), self.grams, axes=1) + self.prior
 
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -64,10 +67,12 @@ class Linearisation:
         return self.z[self.posterior.free] + step, factor, log_marginal
 
     def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Factor L of the precision (..., f, f), L' (mean - z), and the marginal log density.
+        """Factor L of the precision (..., f, f), L' (mean - z) (..., f), and log density (...).
 
-        All three follow from one Cholesky factor of the bordered matrix: its last row is the
-        vector, its last entry the root of the weighted sum of squares that remains at the mean.
+        ``eta``: noise coordinates, (..., e). All three follow from one Cholesky factor of the
+        bordered matrix: its last row is the vector, its last entry the root of the weighted sum of
+        squares that remains at the mean. Raises numpy.linalg.LinAlgError if a parameter has no
+        information.
         """
         posterior = self.posterior
         gram = self.gram(eta)
@@ -117,5 +122,5 @@ class Linearisation:
 
 
 def log_determinant(factor: FloatArray) -> FloatArray:
-    """Log determinants (...) of triangular factors (..., f, f)."""
+    """Log determinants (...) of triangular factors (..., f, f) with positive diagonals."""
     return np.sum(np.log(np.diagonal(factor, axis1=-2, axis2=-1)), axis=-1)

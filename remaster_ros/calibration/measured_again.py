@@ -23,9 +23,11 @@ class MeasuredAgain:
 
     @classmethod
     def of(cls, measurements: Measurements) -> MeasuredAgain:
-        """Counts for a session.
+        """Number of held-out configurations, and of those of them that were fitted as well.
 
-        Angles within `SAME_RAD` of a fitted one count as fitted as well.
+        A configuration counts as fitted as well if all its joints are within 0.05 degrees
+        (`SAME_RAD`; for a slide that number in m) of a fitted one; none does if all rows are held
+        out.
         """
         first = np.unique(measurements.configuration, return_index=True)[1]
         q, held_out = measurements.q[first], measurements.is_validation[first]
@@ -41,7 +43,10 @@ class MeasuredAgain:
 
     @property
     def words(self) -> str:
-        """Sentence for the report; '' if no held-out configuration was fitted as well."""
+        """Sentence for the report; '' if no held-out configuration was fitted as well.
+
+        It asks for other configurations if more than half were.
+        """
         if not self.again:
             return ''
         return (

@@ -90,7 +90,12 @@ def independence_sampler(
 
 
 def _states_of_chain(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> list[int]:
-    """Index of the proposal at which the chain is after each step, n indices; -1 is the start."""
+    """Index of the proposal at which the chain is after each step, n indices; -1 is the start.
+
+    ``log_weight``: importance weights of the n proposals; ``log_uniform``: logs of uniform draws,
+    (n,); ``current``: log weight of the start. A step is taken if its log uniform is below the
+    difference of the weights.
+    """
     path, state = [], -1
     for step, (weight, limit) in enumerate(zip(log_weight.tolist(), log_uniform.tolist())):
         # Both weights may be -inf: their difference is NaN, and the step is not taken.

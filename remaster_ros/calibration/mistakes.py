@@ -73,9 +73,10 @@ class Mistakes:
 
 
 def find_mistakes(session: Session) -> Mistakes:
-    """Mistakes without which a session fits its robot.
+    """Mistakes without which a session fits its robot, each tried and fitted.
 
-    ``session``: does not fit its robot, or fits with gross offsets or errors. Raises
+    Nothing is tried, so that ``fitting`` is (), with fewer than 12 rows (`FEWEST_ROWS`) or a joint
+    that slides. ``session``: does not fit its robot, or fits with gross offsets or errors. Raises
     InsufficientDataError if there are too few rows for a fit.
     """
     joints = session.measurements.q.shape[1]
@@ -110,7 +111,11 @@ def _is_sound(session: Session, fit: Fitted) -> bool:
 
 
 def is_gross(found: Estimate) -> bool:
-    """Whether an estimate has larger offsets or errors than a mastered robot can have."""
+    """Whether an estimate has larger offsets or errors than a mastered robot can have.
+
+    An offset above 5 degrees (`LARGEST_OFFSET`, times ``per_radian`` for a slide), or a sensor's
+    sigma above 5 mm (`UNCALIBRATED_ERROR_M`).
+    """
     offsets = found.mode.z[: found.model.joints]
     sigma = found.posterior.noise(found.mode.eta).sigma
     limit = LARGEST_OFFSET * found.model.chain.per_radian
@@ -125,8 +130,10 @@ def sound_estimate(
 ) -> Estimate:
     """Estimate of a session that fits its robot; ``fitted``: function that estimates it.
 
-    Raises MistakeFoundError if the session does not fit, or is gross, and fits without a mistake
-    that the error names; MisfitError if none of the tried mistakes explains it.
+    A gross estimate (`is_gross`) is returned all the same if no mistake explains it. Raises
+    MistakeFoundError, which names the mistake, if the session does not fit or is gross, and fits
+    without it; MisfitError if it does not fit and none of the tried mistakes explains it; and
+    InsufficientDataError and InputError as ``fitted``.
     """
     try:
         found = fitted(Problem.of(session, priors))
@@ -158,7 +165,10 @@ def sound_estimate(
 
 
 def _mistake_found(session: Session, mistakes: Mistakes, what: str) -> MistakeFoundError:
-    """Error that names the mistakes, with the options of the import that correct them."""
+    """Error that names the mistakes, with the import's options that correct the first.
+
+    ``mistakes``: with at least one fit; ``what``: beginning of its sentence.
+    """
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     columns = Columns(chain.joint_names, chain.joint_names)
     sentence, options = sentence_of_mistakes(mistakes, session, columns)
@@ -166,10 +176,10 @@ def _mistake_found(session: Session, mistakes: Mistakes, what: str) -> MistakeFo
 
 
 def _tool_mistakes(session: Session, given: Fitted) -> list[Fitted]:
-    """Tip links and turns of the tool with which the markers are at their stated positions.
+    """Fits of tip links, tool turns and exchanged labels with markers at their stated positions.
 
-    If there are none: the fit with other marker positions. Empty if the markers are at their
-    stated positions already.
+    Stated to within 5.5 stated standard deviations, but at least 5 mm. [] if the markers of
+    ``given`` are there already, or if nothing tried brings them there.
     """
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if given.marker_shift_m < allowed:
@@ -197,7 +207,7 @@ def _tool_mistakes(session: Session, given: Fitted) -> list[Fitted]:
 
 
 def _pairs(m: Measurements) -> list[tuple[int, int]]:
-    """Pairs of markers that one sensor has measured."""
+    """Pairs (a, b), a < b, of markers (indices) that one sensor has measured, sorted."""
     pairs: set[tuple[int, int]] = set()
     for sensor in np.unique(m.sensor):
         pairs |= set(combinations(np.unique(m.marker[m.sensor == sensor]).tolist(), 2))
@@ -226,7 +236,12 @@ def _mistakes_from_row(session: Session) -> Iterator[Arrangement]:
 
 
 def _divisions(session: Session, before: Measurements, after: Measurements) -> Iterator[int]:
-    """Rows at which a change from the first table to the second fits best, from either half."""
+    """Yield rows (index from 0) at which a change from the first table to the second fits best.
+
+    At most two: by the fit of the first half of ``before``, and of the last half of ``after``.
+    None with fewer than 12 rows (`FEWEST_ROWS`) in a half, or if the best is the first or the last
+    end.
+    """
     half = len(before) // 2
     if half < FEWEST_ROWS:
         return
@@ -241,7 +256,11 @@ def _divisions(session: Session, before: Measurements, after: Measurements) -> I
 def _costs(
     session: Session, part: Measurements, before: Measurements, after: Measurements
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Robust cost of every row of two tables by the fit of a part; None if the fit fails."""
+    """Robust cost of every row of two tables, (n,) each, by a fit of a part; None if it fails.
+
+    Also None if a table has other sensors or markers than the part. The cost is log(1 + d² / w²)
+    of the distance d, w being 2.5 (`CAUCHY_WIDTH`) times the sensor's robust spread.
+    """
 
     def problem(m: Measurements) -> Problem:
         fitted = replace(m, is_validation=np.zeros(len(m), bool))
@@ -283,7 +302,10 @@ class Columns:
 def sentence_of_mistakes(
     mistakes: Mistakes, session: Session, columns: Columns
 ) -> tuple[str, str]:
-    """Sentence with the mistakes, and the options that correct the first of them."""
+    """Sentence with the mistakes, and the options that correct the first of them.
+
+    Others that fit as well follow with their options, if they take at most one change more.
+    """
     found, given = mistakes.fitting[0], mistakes.given
     words, options = in_words(found.arrangement, session, columns)
     sentence = f'with {words} the data fit to {shown_mm(found.error_m)}; without, to '
@@ -317,7 +339,10 @@ def sentence_of_mistakes(
 
 
 def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[str, str]:
-    """Changes of an arrangement in words, and the options of ``remaster import`` for them."""
+    """Changes of an arrangement in words, and the options of ``remaster import`` for them.
+
+    Both are '' without a change. ``columns``: names and units of the table's columns.
+    """
     names = [columns.shown[column] for column in found.order]
     words, options = [], []
     given = Arrangement.given(len(names))
@@ -376,7 +401,10 @@ def in_words(found: Arrangement, session: Session, columns: Columns) -> tuple[st
 
 
 def _row_range(found: Arrangement) -> tuple[str, str]:
-    """Rows of a mistake in words, and as options have them."""
+    """Rows of a mistake in words, and as an option's suffix: '@12-' from, '@-12' before 12.
+
+    Both are '' for all rows.
+    """
     if found.since is not None:
         return f' from observation {found.since} on', f'@{found.since}-'
     if found.until is not None:
@@ -385,6 +413,6 @@ def _row_range(found: Arrangement) -> tuple[str, str]:
 
 
 def shown_mm(length: float) -> str:
-    """Length, m, in mm for a sentence."""
+    """Length, m, in mm for a sentence: whole mm from 10 mm on, below that two digits."""
     size = 1e3 * length
     return f'{size:.0f} mm' if size >= 10.0 else f'{size:.2g} mm'

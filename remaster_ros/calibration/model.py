@@ -90,12 +90,12 @@ class Model:
 
     @property
     def has_causes(self) -> bool:
-        """Whether it has further parameters that are causes of error, not of motion."""
+        """Whether the extension has parameters that are causes of error, not only of motion."""
         return self.extension is not None and not self.extension.of_motion
 
     @property
     def core(self) -> int:
-        """Number of parameters without the extension's: offsets, registrations, tools."""
+        """Number of parameters before those of the extension: offsets to bodies' rotations."""
         return self.markers_end + 3 * len(self.bodies)
 
     @property
@@ -105,12 +105,16 @@ class Model:
 
     @property
     def size(self) -> int:
-        """Length of the parameter vector."""
+        """Length of the parameter vector, the extension included."""
         return self.core + (len(self.extension.names) if self.extension is not None else 0)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
+        """Names of the parameters, in order, (size) strings.
+
+        Joint names, 'registration.<sensor>.x' to 'rz', 'marker.<marker>.x', 'body.<body>.rx' and
+        'effect.<name>'.
+        """
         names = list(self.chain.joint_names)
         for sensor in self.sensor_names:
             names += [f'registration.{sensor}.{axis}' for axis in REGISTRATION_AXES]
@@ -138,11 +142,11 @@ class Model:
         return Rows.with_turns(measurements, rows, self.reference, self.bodies, self.on_tool)
 
     def rows_of_path(self, measurements: Measurements, rows: IntArray) -> Rows:
-        """Return given rows of the session as `rows`, errors correlated along its path."""
+        """Given rows (indices) as `rows`, with errors correlated along the path, if any."""
         return self.rows(measurements, rows).along_path(self.path_noise)
 
     def registration(self, sensor: int) -> slice:
-        """Slice of a sensor's correction in the parameter vector."""
+        """Slice of a sensor's correction (x, y, z, rx, ry, rz), by its index, in the vector."""
         start = self.joints + 6 * sensor
         return slice(start, start + 6)
 
@@ -152,7 +156,7 @@ class Model:
         return slice(start, start + 3)
 
     def body(self, body: int) -> slice:
-        """Slice of a body's rotation in the parameter vector."""
+        """Slice of a body's rotation vector, by its index in ``bodies``, in the vector."""
         start = self.markers_end + 3 * body
         return slice(start, start + 3)
 
@@ -171,7 +175,10 @@ class Model:
         return x[..., : self.joints]
 
     def markers(self, x: FloatArray) -> FloatArray:
-        """Marker positions in T, m, (..., markers, 3)."""
+        """Marker positions in the tool frame T, m, (..., markers, 3), a view of x (..., size).
+
+        Pinned parameters have pinned positions: see the module.
+        """
         start = self.joints + 6 * len(self.sensor_names)
         part = x[..., start : self.markers_end]
         return part.reshape(*x.shape[:-1], len(self.marker_names), 3)
@@ -187,7 +194,10 @@ class Model:
         return x[..., self.core :]
 
     def corrections(self, x: FloatArray) -> FloatArray:
-        """Corrections C of the registrations as transforms, (..., sensors, 4, 4)."""
+        """Corrections C of the registrations as transforms of points in R, (..., sensors, 4, 4).
+
+        From (x, y, z, rx, ry, rz) of each sensor, about its centroid; ``x``: (..., size).
+        """
         end = self.joints + 6 * len(self.sensor_names)
         parts = x[..., self.joints : end].reshape(*x.shape[:-1], len(self.sensor_names), 6)
         turn = rotation_vector_to_matrix(parts[..., 3:])
@@ -199,7 +209,7 @@ class Model:
         return inverse(self.corrections(x)) @ self.reference
 
     def with_corrections(self, x: FloatArray, corrections: FloatArray) -> FloatArray:
-        """Parameters x with the corrections C, (..., sensors, 4, 4), in the place of their own."""
+        """Copy of parameters x (..., size) with the corrections C, (..., sensors, 4, 4)."""
         shift = apply(corrections, self.centroid) - self.centroid
         turn = matrix_to_rotation_vector(corrections[..., :3, :3])
         parts = np.concatenate((shift, turn), axis=-1)
@@ -209,15 +219,21 @@ class Model:
         return result
 
     def pinned(self, x: FloatArray) -> FloatArray:
-        """Pinned coordinates (..., size) of natural ones."""
+        """Pinned coordinates (..., size) of natural ones, a copy with the same offsets.
+
+        Registrations take up the motion of joint 1, markers and bodies that of joint k.
+        """
         return self._turned(x, 1.0)
 
     def natural(self, z: FloatArray) -> FloatArray:
-        """Natural coordinates (..., size) of pinned ones."""
+        """Natural coordinates (..., size) of pinned ones, a copy; the inverse of `pinned`."""
         return self._turned(z, -1.0)
 
     def _turned(self, x: FloatArray, sign: float) -> FloatArray:
-        """Parameters with registrations turned with joint 1, and markers with joint k."""
+        """Parameters with registrations moved with joint 1, and markers and bodies with joint k.
+
+        ``sign``: 1.0 to pin, -1.0 for the inverse.
+        """
         if not np.any(x[..., [0, self.joints - 1]]):
             # Nothing turns, as where neither joint has a prior.
             return x.copy()
@@ -267,10 +283,9 @@ class Model:
     def predict(self, z: FloatArray, rows: Rows) -> FloatArray:
         """Predicted markers in the references' base coordinates, m, (..., n, 3).
 
-        Of orientations the rotation vector from the measured one, rad.
-
-        ``z``: pinned parameters, (..., size); ``rows``: n observations, those of one sensor
-        consecutive.
+        For rows of orientations it is the rotation vector from the measured one, rad; errors are
+        ``rows.target`` less the prediction. ``z``: pinned parameters, (..., size); ``rows``: n
+        observations, those of one sensor consecutive.
         """
         turns, shifts = self._extended(z, rows)
         count, offsets = rows.points, self._inner_offsets(z)
@@ -303,7 +318,10 @@ class Model:
         return predicted if rows.lever is None else predicted + (rows.measured - rows.target)
 
     def _places(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Positions of the rows' points on the tool, m, (..., n, 3)."""
+        """Positions of the rows' points on the tool, in T, m, (..., n, 3).
+
+        The marker, and for a sensor on the tool the point that it measured.
+        """
         places = self.markers(z)[..., rows.marker, :]
         if rows.lever is not None:
             assert rows.body is not None
@@ -337,7 +355,7 @@ class Model:
         return index if index < count else rows.turning[index - count]
 
     def jacobian(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Derivative of `predict` by the pinned parameters, (n, 3, size).
+        """Derivative of `predict` by the pinned parameters, (n, 3, size); ``z``: (size,).
 
         The columns of the outer two joints are zero.
         """
@@ -346,7 +364,7 @@ class Model:
         return derivative
 
     def natural_jacobian(self, x: FloatArray, rows: Rows) -> FloatArray:
-        """Derivative of `predict` by the natural parameters, (n, 3, size)."""
+        """Derivative of `predict` by the natural parameters x (size,), (n, 3, size)."""
         return self._derivative(self.offsets(x), x, rows)
 
     def inner_pose(self, z: FloatArray, rows: Rows) -> Pose:
@@ -354,7 +372,7 @@ class Model:
         return self._pose(self._inner_offsets(z), z, rows)
 
     def _pose(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> Pose:
-        """Pose of the arm in each row by offsets (…, k) and parameters x, effects included."""
+        """Pose of the arm in each row by offsets (k,) and parameters x (size,), with effects."""
         turns, shifts = self._extended(x, rows)
         shifts = shifts @ self._transform_of_first_joint(offsets[0])[:3, :3].T
         angles = rows.q + offsets
@@ -376,7 +394,10 @@ class Model:
         return offsets
 
     def _extended(self, x: FloatArray, rows: Rows) -> tuple[dict[int, FloatArray], FloatArray]:
-        """Angles of joints, rad, and displacements, m, that the extension adds to each row."""
+        """Angles of joints, index -> rad, (..., n), and displacements, m, (..., n, 3), by effects.
+
+        {} and zeros (3,) without an extension.
+        """
         if self.extension is None:
             return {}, np.zeros(3)
         given, theta = self.extension, self.theta(x)
@@ -433,9 +454,10 @@ class Model:
     def _by_bodies(
         self, derivative: FloatArray, x: FloatArray, rows: Rows, span: slice, by_turn: FloatArray
     ) -> None:
-        """Derivative of rows by b, written into ``derivative``.
+        """Write the derivative of rows by the bodies' rotations into ``derivative`` (n, 3, size).
 
-        ``by_turn`` is by a small rotation of the body in T.
+        ``span``: the rows; ``by_turn``: their derivative by a small rotation of the body in T,
+        (rows of the span, 3, 3).
         """
         assert rows.body is not None
         for body in range(len(self.bodies)):
@@ -474,7 +496,10 @@ def _cross_matrix(vectors: FloatArray) -> FloatArray:
 
 
 def _left_jacobian(vector: FloatArray) -> FloatArray:
-    """Left Jacobian (3, 3): change of a rotation vector to small rotation on its left."""
+    """Left Jacobian (3, 3) of a rotation vector (3,), rad: its change to a rotation on its left.
+
+    exp(r + dr) = exp(J dr) exp(r) to first order.
+    """
     angle = float(np.linalg.norm(vector))
     K = _cross_matrix(vector)
     if angle < 1e-4:
@@ -485,11 +510,10 @@ def _left_jacobian(vector: FloatArray) -> FloatArray:
 
 
 def _rotation_vector(rotation: FloatArray) -> FloatArray:
-    """Rotation vectors (..., 3), rad, of matrices (..., 3, 3) with small angles.
+    """Rotation vectors (..., 3), rad, of rotation matrices (..., 3, 3); faster than SciPy's.
 
-    Faster than SciPy's.
-
-    A rotation by half a turn has no axis here; `matrix_to_rotation_vector` converts it.
+    Angles up to half a turn; rotations within about 1e-3 rad of that are converted by
+    `matrix_to_rotation_vector`.
     """
     skew = rotation - np.swapaxes(rotation, -1, -2)
     axis = 0.5 * np.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), axis=-1)
@@ -506,7 +530,7 @@ def _rotation_vector(rotation: FloatArray) -> FloatArray:
 
 
 def _inverse_left_jacobian(vectors: FloatArray) -> FloatArray:
-    """Inverses (n, 3, 3) of `_left_jacobian` of rotation vectors (n, 3)."""
+    """Inverses (n, 3, 3) of the left Jacobians of rotation vectors (n, 3), rad."""
     angle = np.linalg.norm(vectors, axis=-1)
     K = _cross_matrix(vectors)
     near = angle < 1e-4

@@ -41,8 +41,9 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
     """Change of the readings in time; None if time does not explain their errors.
 
     The moment divides the means of the poses best. A step is tested by F over all moments
-    (Bonferroni), and against drifts and positions by the Bayesian information criterion (Schwarz
-    1978): it has to be 1 / `SIGNIFICANCE` times as probable.
+    (Bonferroni, 0.1 %), and against drifts and positions by the Bayesian information criterion
+    (Schwarz 1978): it has to be 1 / `SIGNIFICANCE` times as probable. None also with fewer than 8
+    poses, without times, or if early and late poses are in different places.
 
     ``rows``: rows of one sensor in any order, (n,); ``errors``: measured minus modelled positions
     of these rows in any one frame, m, (n, 3).
@@ -85,18 +86,22 @@ def moved_since(measurements: Measurements, rows: IntArray, errors: FloatArray) 
 
 
 def _of_poses(values: FloatArray, index: IntArray) -> FloatArray:
-    """Means (poses, m) of the rows (n, m) of each pose."""
+    """Means (poses, m) of the rows (n, m) of each pose; ``index``: pose of a row, from 0, (n,)."""
     count = np.bincount(index)
     return np.column_stack([np.bincount(index, axis) / count for axis in values.T])
 
 
 def _standardised(values: FloatArray) -> FloatArray:
+    """Values (n, m) less their means, over one standard deviation of all columns together."""
     centred = values - values.mean(axis=0)
     return centred / max(float(np.std(centred)), 1e-9)
 
 
 def _drifts(time: FloatArray) -> Iterator[FloatArray]:
-    """Columns (n, p) of each drift over times (n,)."""
+    """Yield the columns (n, p) of each drift over times (n,), without the constant.
+
+    Polynomials of degree 1 to 3, warm-ups with three time constants, and bends at nine moments.
+    """
     share = (time - time.min()) / np.ptp(time)
     polynomials = _polynomials(time)
     for degree in range(1, polynomials.shape[1] + 1):
@@ -109,7 +114,11 @@ def _drifts(time: FloatArray) -> Iterator[FloatArray]:
 
 
 def _places(time: FloatArray, place: FloatArray) -> Iterator[FloatArray]:
-    """Columns of each field over positions (n, 3), constant or growing with time."""
+    """Yield the columns (n, p) of each field over positions (n, 3), constant or growing with time.
+
+    First and second degree; fields with as many columns as half of the n means or more are left
+    out.
+    """
     first, second = np.triu_indices(3)
     fields = place, np.concatenate((place, place[:, first] * place[:, second]), axis=1)
     drift = _polynomials(time)[:, :1]
@@ -126,7 +135,7 @@ def _polynomials(time: FloatArray) -> FloatArray:
 
 
 def _unexplained(values: FloatArray, columns: FloatArray) -> float:
-    """Sum of squares of values (n, m) that a constant and columns (n, p) leave."""
+    """Sum of squares of values (n, m) that a constant and columns (n, p) leave; at least 1e-30."""
     columns = np.column_stack((np.ones(len(values)), columns))
     fitted = columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
     return max(float(np.sum((values - fitted) ** 2)), 1e-30)
@@ -138,6 +147,10 @@ def _criterion_of(means: FloatArray, columns: FloatArray) -> float:
 
 
 def _criterion(unexplained: float, columns: float, poses: int) -> float:
-    """Bayesian information criterion of three axes with common noise."""
+    """Bayesian information criterion of three axes with common noise; less is more probable.
+
+    ``unexplained``: sum of squares, m²; ``columns``: parameters per axis; ``poses``: number of
+    means.
+    """
     count = 3 * poses
     return float(count * np.log(unexplained / count) + 3 * columns * np.log(count))

@@ -82,7 +82,10 @@ class ErrorGroup:
 
 
 def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
-    """Error groups of each channel, by frame sizes; only groups with independent errors."""
+    """Error groups of each channel, by frame sizes; only groups with independent errors.
+
+    In the order of the channels, each 'rows', then 'frames' and 'poses' by ascending size.
+    """
     found = []
     for index, channel in enumerate(channels):
         groups_of_sensor = np.flatnonzero(rows.group_sensor == channel.sensor)
@@ -188,9 +191,9 @@ class NoiseModel:
 
     @property
     def split(self) -> tuple[int, ...]:
-        """Sensors with a separate noise along their line of sight.
+        """Indices of the sensors with a separate noise along their line of sight, ascending.
 
-        Orientations as in `Rows.spans`.
+        Orientations of sensor ``turning[i]`` have the index S + i, S being the number of sensors.
         """
         return tuple(channel.sensor for channel in self.channels if channel.direction == 'along')
 
@@ -220,17 +223,17 @@ class NoiseModel:
 
     @cached_property
     def size_of(self) -> FloatArray:
-        """Share of pose_sigma² in the variance of each error group, (error groups,)."""
+        """Factor of pose_sigma² in the variance of each error group, (error groups,); 0 or m M."""
         return np.array([group.size for group in self.error_groups])
 
     @cached_property
     def frame_size_of(self) -> FloatArray:
-        """Share of frame_sigma² in the variance of each error group, (error groups,)."""
+        """Factor of frame_sigma² in the variance of each error group, (error groups,); 0 or M."""
         return np.array([group.frame_size for group in self.error_groups])
 
     @cached_property
     def freedom(self) -> FloatArray:
-        """Number of independent errors in each error group, (error groups,)."""
+        """Number of independent numbers in each error group, (error groups,)."""
         return np.array([group.freedom for group in self.error_groups], dtype=float)
 
     def variances(self, noise: Noise) -> FloatArray:
@@ -244,11 +247,14 @@ class NoiseModel:
 
     @property
     def shares(self) -> list[int]:
-        """Channels of the common parts: those `separable`, then those `framed`."""
+        """Channels (indices) of the common parts: those `separable`, then those `framed`."""
         return [*self.separable, *self.framed]
 
     def noise(self, sigma: FloatArray, shared: FloatArray) -> Noise:
-        """Noise with sigma of the channels and the common parts of `shares`, m, (..., s)."""
+        """Noise with sigma of the channels, m, (..., channels), and the common parts, m, (..., s).
+
+        ``shared``: in the order of `shares`; channels without a common part have 0.
+        """
         pose_sigma, frame_sigma = np.zeros_like(sigma), np.zeros_like(sigma)
         count = len(self.separable)
         pose_sigma[..., list(self.separable)] = shared[..., :count]
@@ -256,12 +262,15 @@ class NoiseModel:
         return Noise(sigma, pose_sigma, frame_sigma)
 
     def shared(self, noise: Noise) -> FloatArray:
-        """Common parts, as in `shares`, of a noise, m, (..., s)."""
+        """Common parts, in the order of `shares`, of a noise, m, (..., s)."""
         parts = noise.pose_sigma[..., self.separable], noise.frame_sigma[..., self.framed]
         return np.concatenate(parts, axis=-1)
 
     def of_sensors(self, sigma: FloatArray, pose_sigma: FloatArray) -> Noise:
-        """Noise with one sigma and pose_sigma for each sensor, m, (sensors,) each."""
+        """Noise of each channel from one sigma and pose_sigma for each sensor, m, (sensors,) each.
+
+        ``frame_sigma`` is 0.
+        """
         sensor = [channel.sensor for channel in self.channels]
         return Noise(sigma[..., sensor], pose_sigma[..., sensor], np.zeros(len(sensor)))
 
@@ -293,7 +302,7 @@ class NoiseModel:
         return result
 
     def sums_of_squares(self, errors: FloatArray) -> FloatArray:
-        """Sum of squares in each error group, m², of errors (..., n, 3)."""
+        """Sum of squares in each error group, m², (..., error groups), of errors (..., n, 3)."""
         # The rows first, in memory too: each sum is over long rows.
         values = np.moveaxis(errors.reshape(-1, *errors.shape[-2:]), 0, -1)
         values = np.ascontiguousarray(values)
@@ -375,7 +384,7 @@ class NoiseModel:
 
     @cached_property
     def contained(self) -> dict[int, list[int]]:
-        """Error groups of kind 'frames' -> the groups whose sums are contained in theirs."""
+        """Error groups of kind 'frames' -> the groups contained in their sums (indices)."""
         return {
             index: [
                 other

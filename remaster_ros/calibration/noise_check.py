@@ -74,7 +74,12 @@ class NoiseCheck(Struct, frozen=True):
     def of(
         cls, after_m: float, stated_m: float | None, within_m: float | None, **more: Any
     ) -> Self:
-        """Comparison of an error with the noise; arguments as the attributes."""
+        """Comparison of an error with the noise; arguments as the attributes.
+
+        Explained: an error of at most 2.5 (`MOST`) times the mean length of the noise, with a
+        factor for few poses; None if the noise is unknown and the error below that of no
+        instrument.
+        """
         check = cls(None, after_m, None, stated_m, within_m, **more)
         std, explained = check.noise_std_m, None
         noise_m = None if std is None else MEAN_LENGTH * check.spread * std
@@ -86,7 +91,10 @@ class NoiseCheck(Struct, frozen=True):
 
     @property
     def spoilt(self) -> str:
-        """Sentence on gross errors in the held-out rows; '' if their influence is small."""
+        """Sentence on gross errors in the held-out rows; '' if their influence is small.
+
+        Small: the mean error with them is at most 1.5 times (`SPOILT`) that without.
+        """
         if not self.gross or self.mean_m <= SPOILT * self.after_m:
             return ''
         listed = ', '.join(map(str, self.gross[:LISTED]))
@@ -106,16 +114,21 @@ class NoiseCheck(Struct, frozen=True):
 
     @property
     def noise_std_m(self) -> float | None:
-        """Reliable noise per axis, m; None if neither figure is known."""
+        """Reliable noise per axis, m; None if neither figure is known.
+
+        The larger of the stated one and that within poses, of which at most 5 times (`SCATTER`)
+        the stated one counts.
+        """
         if self.stated_std_m is None or self.within_pose_std_m is None:
             return self.stated_std_m if self.within_pose_std_m is None else self.within_pose_std_m
         return max(self.stated_std_m, min(self.within_pose_std_m, SCATTER * self.stated_std_m))
 
     @property
     def is_of_no_instrument(self) -> bool:
-        """Whether the error is larger than any instrument's.
+        """Whether the error is that of no instrument, and the sensor's samples show none as large.
 
-        Last result: the sensor's samples do not show it.
+        Above 5 mm per axis (`UNCALIBRATED_ERROR_M`) as a mean length, times ``spread`` and a
+        factor for few poses.
         """
         most = MEAN_LENGTH * self.spread * self._few * UNCALIBRATED_ERROR_M
         shown = self.stated_std_m is not None and self.stated_std_m >= UNCALIBRATED_ERROR_M
@@ -137,7 +150,7 @@ class NoiseCheck(Struct, frozen=True):
 
     @property
     def _few(self) -> float:
-        """Factor by which the mean of few poses may be larger by chance."""
+        """Factor by which the mean of few poses may be larger by chance: 1 + 1 / √poses."""
         return float(1.0 + 1.0 / np.sqrt(self.poses))
 
 
@@ -148,8 +161,9 @@ def check_noise(
     left_out: IntArray,
     parameters: int,
 ) -> tuple[NoiseCheck, ...]:
-    """Comparison of the error after a fit with the noise, for each sensor.
+    """Comparison of the error after a fit with the noise, for each sensor with rows that count.
 
+    The worst twentieth of the rows, or the gross ones if more, is left out of the mean.
     ``measurements``: n observations; held-out rows are judged if the sensor has any, else fitted
     ones; ``sensor_names``: in index order; ``residuals``: measured minus modelled positions, m,
     (n, 3); ``left_out``: ``observation`` of every row that was not fitted; ``parameters``: number
@@ -184,7 +198,11 @@ def check_noise(
 
 
 def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> tuple[int, ...]:
-    """Observations of the rows that are gross by the rule of the fit."""
+    """Observation numbers of the rows that are gross with a probability above 99 % (`CERTAIN`).
+
+    ``errors``: lengths, m, (n,); ``rows``: mask of those judged, (n,). () without rows, or if more
+    than a tenth is gross (one always may be): then a fit would refuse them.
+    """
     if not rows.any():
         return ()
     gross = gross_probability(errors[rows] / robust_scale(errors[rows])) > CERTAIN
@@ -194,9 +212,10 @@ def _gross(measurements: Measurements, errors: FloatArray, rows: BoolArray) -> t
 
 
 def _spread(fitted: Measurements, parameters: int) -> float:
-    """Ratio of the error at poses that were not fitted to the noise, by a linear model.
+    """Ratio of the error at poses that were not fitted to the noise, by a linear model, 1 to 2.
 
-    Each pose of each sensor and marker counts three numbers.
+    √(1 + p / (N - p - 1)) with p ``parameters`` and N numbers, three for each pose of each sensor
+    and marker.
     """
     readings = np.unique(np.stack((fitted.pose, fitted.sensor, fitted.marker)), axis=1).shape[1]
     free = max(3 * readings - parameters - 1, 1)
@@ -204,7 +223,10 @@ def _spread(fitted: Measurements, parameters: int) -> float:
 
 
 def _stated(measurements: Measurements) -> float | None:
-    """RMS of the standard errors of the readings, by the scatter of their samples, m."""
+    """RMS of the standard errors of the readings per axis, by the scatter of their samples, m.
+
+    None if no reading has a scatter, or if all are 0, which stands for an unknown one.
+    """
     std = measurements.std / np.sqrt(np.maximum(measurements.samples, 1))[:, None]
     known = std[np.isfinite(std)]
     rms = float(np.sqrt(np.mean(known**2))) if len(known) else 0.0
@@ -215,7 +237,8 @@ def _stated(measurements: Measurements) -> float | None:
 def _within(measurements: Measurements, residuals: FloatArray, rows: BoolArray) -> float | None:
     """Standard deviation per axis of the errors within poses, m, by the median over the rows.
 
-    A sensor that was moved during a pose does not influence the median.
+    ``rows``: mask of one sensor's rows, (n,). Rows of one pose and marker are compared; None if no
+    pose has two. A sensor that was moved during a pose does not influence the median.
     """
     _, group = np.unique(
         np.stack((measurements.pose[rows], measurements.marker[rows])), axis=1, return_inverse=True

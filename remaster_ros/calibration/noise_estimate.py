@@ -59,7 +59,11 @@ KEYS = NoiseEstimate.__struct_fields__[:6]
 
 
 def noise_estimates(posterior: Posterior, by_channel: Noise) -> dict[str, NoiseEstimate]:
-    """Noise of every sensor from draws of the channels' noise (chains, draws, …)."""
+    """Noise of every sensor by name, then of orientations, from draws of the channels' noise.
+
+    ``by_channel``: (chains, draws, channels). Means and standard deviations over all draws; a part
+    that a sensor's noise does not have is None (pose_sigma) or UNSET (frame_sigma).
+    """
     noise_model = posterior.noise_model
     by_sensor = noise_model.sensor_noise(by_channel)
     separate = {noise_model.channels[index].sensor for index in noise_model.separable}

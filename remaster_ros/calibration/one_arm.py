@@ -46,19 +46,22 @@ class OffsetDifferences:
 
     @property
     def differ(self) -> bool:
-        """Whether the two sessions have different offsets."""
+        """Whether the two sessions have different offsets: ``p_value`` below 1e-4 (`FALSE`)."""
         return self.p_value < FALSE
 
     @property
     def mostly(self) -> bool:
-        """Whether half of the offsets or more differ, as with another arm."""
+        """Whether they differ, half of the offsets or more by over 3 standard deviations."""
         return self.differ and bool(
             2 * np.sum(np.abs(self.sigmas) > DIFFERENT_SIGMAS) >= len(self.sigmas)
         )
 
     @property
     def words(self) -> str:
-        """Joints that differ, each with its difference in standard deviations."""
+        """Joints that differ by over 3 standard deviations, each with its number, as text.
+
+        Without any: '<all joints> taken together'.
+        """
         shown = [
             f'{joint} by {abs(by):.0f}'
             for joint, by in zip(self.joints, self.sigmas, strict=True)
@@ -72,7 +75,8 @@ class OffsetDifferences:
 def offset_differences(first: Estimate, second: Estimate) -> OffsetDifferences | None:
     """Differences of the zero-offsets of two sessions of the same robot description.
 
-    None if both sessions together determine no joint's offset.
+    Second less first. None if no joint's offset is determined by both, to a standard deviation of
+    1 degree (`OPEN_ANGLE`, times ``per_radian`` for a slide).
     """
     sessions = [_SessionOffsets.of(found) for found in (first, second)]
     known = np.logical_and(*(session.known for session in sessions))

@@ -52,7 +52,8 @@ class OrientationInformation:
 def orientation_information(mode: Mode) -> OrientationInformation | None:
     """Comparison of a fit with that of the positions alone, linear about its mode.
 
-    None if no orientations are fitted.
+    None if no orientations are fitted. If the positions alone do not determine the parameters, the
+    std without is infinite, the shift 0 and the probability 1.
     """
     posterior = mode.linearisation.posterior
     if not posterior.rows.turning:
@@ -129,11 +130,12 @@ def orientation_accuracy(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """Both errors before and after; {} if the chosen rows have no orientation.
+    """Errors of orientations before and after, as fit.json has them, in degrees.
 
-    ``measurements``: n observations; ``modelled``: orientations of the same rows; ``fitted``: rows
-    that determine R_T_B of every sensor and marker; ``chosen``: rows that are judged; ``pairs``:
-    joint solutions of the same pose, (m, 2).
+    {} if the chosen rows have no orientation; 'relative_orientation' has a reason ``why`` in place
+    of numbers without pairs. ``measurements``: n observations; ``modelled``: orientations of the
+    same rows; ``fitted``: rows that determine R_T_B of every sensor and marker; ``chosen``: rows
+    that are judged; ``pairs``: joint solutions of the same pose, (m, 2).
     """
     assert measurements.orientation is not None
     seen = np.all(np.isfinite(measurements.orientation), axis=1)
@@ -166,7 +168,7 @@ def orientation_accuracy(
 
 
 def _measured(measurements: Measurements, rows: IntArray) -> Rotation:
-    """Measured orientations of some rows."""
+    """Measured orientations R_N_B of some rows (indices); the session has to have them."""
     assert measurements.orientation is not None
     return Rotation.from_quat(measurements.orientation[rows])
 

@@ -69,11 +69,11 @@ def find_outliers(
     """Gross rows, by repeated fits without them until the same rows are left out.
 
     If a row is good in a fit without it and gross in a fit with it, it is kept: rows are judged by
-    the others. ``rows``: all rows; ``refit``: fits the rows that are True, (n,), and returns the
-    errors of all, m, (n, 3); ``errors``: errors of a first, robust fit, m, (n, 3);
-    ``sensor_names``: for the messages; ``gross``: rows that are known to be gross, (n,), or None.
-    Raises MisfitError if more than a tenth of a sensor's rows would be left out, or too many are
-    gross to identify them.
+    the others. At most 20 refits. ``rows``: all rows; ``refit``: fits the rows that are True,
+    (n,), and returns the errors of all, m, (n, 3); ``errors``: errors of a first, robust fit, m,
+    (n, 3); ``sensor_names``: for the messages; ``gross``: rows that are known to be gross, (n,),
+    or None. Raises MisfitError if more than a tenth of a sensor's rows would be left out, or too
+    many are gross to identify them.
     """
     _require_majority(rows, errors, sensor_names)
     gross = np.zeros(len(rows), dtype=bool) if gross is None else gross
@@ -92,7 +92,12 @@ def find_outliers(
 
 
 def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
-    """Judgement of every row by the rows that are not gross yet."""
+    """Judgement of every row by the rows that are not gross yet.
+
+    A row is compared with the other rows of its pose, a pose of several rows with the other poses;
+    gross is a probability above 99 % (`CERTAIN`), and both halves of a reading with orientation
+    are. ``errors``: m (rad), (n, 3); ``gross``: mask of rows that do not count, (n,).
+    """
     group = rows.group_of_row
     sensor = rows.group_sensor[group]
     good = ~gross
@@ -165,7 +170,8 @@ def gross_probability(sigmas: FloatArray) -> FloatArray:
     """Probability (n,) that each of three-dimensional errors is gross.
 
     ``sigmas``: lengths of the errors in standard deviations of good errors, (n,). A mixture of two
-    Gaussians, whose share and width fit these errors.
+    Gaussians, the wide one at least 20 times as wide (`NARROWEST`), whose share and width fit
+    these errors by expectation maximisation.
     """
     square = sigmas**2
     share, excess = PRIOR_GROSS / PRIOR_ROWS, NARROWEST**2
@@ -188,9 +194,10 @@ def gross_probability(sigmas: FloatArray) -> FloatArray:
 
 
 def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Sigma and pose_sigma of each sensor, m, (sensors,) each, robust against a few outliers.
+    """Sigma and pose_sigma of each sensor, m, one for each of ``rows.spans``, robust to outliers.
 
-    If poses have one row each, all of the error counts as sigma.
+    If poses have one good row each, all of the error counts as sigma. ``errors``: m, (n, 3);
+    ``good``: mask of the rows that count, (n,).
     """
     group = rows.group_of_row
     count = rows.group_sum(good.astype(float))
@@ -214,12 +221,19 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
 
 
 def robust_scale(lengths: FloatArray) -> float:
-    """Standard deviation per axis of three-dimensional errors of these lengths, m."""
+    """Standard deviation per axis of three-dimensional errors of these lengths (n,), m.
+
+    The larger of those by the median and by the 80 % quantile, plus 0.1 µm; at least one length.
+    """
     return float(np.max(np.quantile(lengths, _QUANTILES) / _EXPECTED)) + RESOLUTION_M
 
 
 def _require_majority(rows: Rows, errors: FloatArray, sensor_names: Sequence[str]) -> None:
-    """Raises MisfitError if the data have too many gross errors to identify them."""
+    """Raise MisfitError if a sensor has too many gross errors to identify them.
+
+    That is if the scale by the 80 % quantile is over 4 times (`TAIL_LIMIT`) that by the median;
+    sensors with fewer than 60 rows (`FEWEST_TO_JUDGE`) are not judged.
+    """
     names = _names(rows, sensor_names)
     for sensor, span in rows.spans:
         turned = span.start >= rows.points
@@ -253,12 +267,12 @@ def _guard(rows: Rows, gross: BoolArray, sensor_names: Sequence[str]) -> None:
 
 
 def _names(rows: Rows, sensor_names: Sequence[str]) -> list[str]:
-    """Names of the sensors, then of their orientations."""
+    """Names of the sensors, then '<sensor> (orientation)' of those with fitted orientations."""
     return [*sensor_names, *(f'{sensor_names[sensor]} (orientation)' for sensor in rows.turning)]
 
 
 def _size(error: float, turned: bool) -> str:
-    """Error in m, or of an orientation in rad, as text."""
+    """Error in m as text in mm; if ``turned`` one in rad in degrees."""
     return f'{np.degrees(error):.2f} degrees' if turned else f'{error * 1e3:.1f} mm'
 
 

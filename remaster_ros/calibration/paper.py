@@ -57,7 +57,11 @@ class PaperPosterior:
 
     @classmethod
     def of(cls, problem: Problem, chains: int, rng: np.random.Generator) -> PaperPosterior:
-        """Posterior of a problem; three random points register each sensor of each chain."""
+        """Posterior of a problem's optimization rows, sampled by a number of chains.
+
+        Three random points register each sensor of each chain. Raises InsufficientDataError if a
+        sensor has no three points that make a triangle.
+        """
         identity = np.tile(np.eye(4), (len(problem.sensor_names), 1, 1))
         rows = Rows.of(problem.measurements, problem.fitted, identity)
         measured = problem.measurements.position[rows.source]
@@ -82,7 +86,10 @@ class PaperPosterior:
         return np.concatenate((zeros, np.full((chains, self.sensors), START_SIGMA_MM)), axis=1)
 
     def split(self, states: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Registrations T_N_R, offsets in rad and sigma in m of states (chains, ..., d)."""
+        """Registrations T_N_R, offsets in rad and sigma in m of states (chains, ..., d).
+
+        Shapes (chains, ..., sensors, 4, 4), (chains, ..., k) and (chains, ..., sensors).
+        """
         turned = 6 * self.sensors
         theta_1 = states[..., :turned].reshape(*states.shape[:-1], self.sensors, 6)
         between = states.ndim - 2
@@ -121,9 +128,10 @@ def fit_paper(
 ) -> Sampled:
     """Fit of a problem as in the paper: markers at nominal, no row left out, no parameter held.
 
-    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16). ``chains, steps``:
-    number of chains, and of steps of each chain with the burn-in; ``progress``: called with the
-    share that is done.
+    All parameters move at once by U(-0.0125, 0.0125) mm and degrees (eq. 16); the last eighth of
+    the steps is kept. ``chains, steps``: number of chains, and of steps of each chain with the
+    burn-in; ``progress``: called with the share that is done. Raises InsufficientDataError as
+    `find_gauge`, or if a sensor has no three points that make a triangle.
     """
     measurements, identity = problem.measurements, problem.empty_model()
     target = PaperPosterior.of(problem, chains, rng)
@@ -183,7 +191,10 @@ def fit_paper(
 def _paper_natural(
     target: PaperPosterior, model: Model, states: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Natural parameters (..., size) and sigma of the paper's states."""
+    """Natural parameters (..., size) and sigma, m, (..., sensors), of the paper's states (..., d).
+
+    Markers are at nominal.
+    """
     T_N_R, offsets, sigma = target.split(states)
     shape = (*states.shape[:-1], model.size)
     x = np.broadcast_to(model.vector(np.zeros(model.joints), target.markers), shape).copy()
@@ -192,7 +203,10 @@ def _paper_natural(
 
 
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
-    """Gauge with the parameters that fix its directions in the paper, with flat priors."""
+    """Gauge whose directions state what fixes them in the paper, which has flat priors.
+
+    A direction of a held joint is fixed by nothing, any other by markers taken as exact.
+    """
     held = {f'{model.names[index]} = 0' for index in gauge.held}
     directions, why = [], list(gauge.why)
     for direction in gauge.directions:
@@ -209,7 +223,10 @@ def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
 
 
 def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> FloatArray:
-    """Standard deviation of each offset by that of the markers, rad, (k,)."""
+    """Standard deviation of each offset by that of the markers, rad, (k,).
+
+    The paper takes markers as exact. 0 for offsets that are held or that no marker determines.
+    """
     variance = np.zeros(model.joints)
     for direction in gauge.directions:
         entries = direction.combination
@@ -225,7 +242,11 @@ def _taken_as_known(gauge: Gauge, model: Model, marker_std_m: FloatArray) -> Flo
 
 
 def _three_points(points: FloatArray, sensor: str, rng: np.random.Generator) -> IntArray:
-    """Indices (3,) of three random points that are not on a line."""
+    """Indices (3,) of three random points (of n, (n, 3)) that are not on a line.
+
+    The triangle's area is over a tenth of the square of its longest side. Raises
+    InsufficientDataError, naming the sensor, if there are fewer than 3 points or 1,000 tries fail.
+    """
     for _ in range(1000):
         if len(points) < 3:
             break

@@ -64,11 +64,14 @@ class PathNoise:
     order: IntArray  # Of Matérn's family, an index into `ORDERS`
 
     def of_frames(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Correlations of frames, each by one of its rows, (f, f)."""
+        """Correlations of frames, (f, f); ``rows``: index of one row of each frame."""
         return self._correlations(sensor, rows, float(self.share[sensor]), 1.0)
 
     def of_markers(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Correlations of the deviations of one marker in some rows, (r, r)."""
+        """Correlations of the deviations of one marker in some rows (indices), (r, r).
+
+        Deviations are from the frames' means.
+        """
         share, scale = float(self.marker_share[sensor]), float(self.marker_scale[sensor])
         return self._correlations(sensor, rows, share, scale)
 
@@ -228,7 +231,7 @@ def path_noise(
 
 
 def _minimised(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[float, FloatArray]:
-    """Least cost near a start, and its position."""
+    """Least cost near a start (d,), and its position (d,), by 60 evaluations at most."""
     simplex = start + np.concatenate((np.zeros((1, len(start))), 0.7 * np.eye(len(start))))
     found = scipy.optimize.minimize(
         cost,
@@ -260,8 +263,10 @@ def _of_markers(
 ) -> tuple[float, float]:
     """Share and scale of the process in the deviations of single markers, by likelihood.
 
-    ``deviations``: deviations, m, (n, 3), of the rows of the first ``frames`` frames and others;
-    ``distance``: between these frames, (f, f).
+    (0.0, 1.0) if there is one marker, or none in more than half of the frames. ``deviations``:
+    from the frames' means, m, (n, 3), of the rows of the first ``frames`` frames and others;
+    ``frame, marker``: of these rows, (n,); ``distance``: between the frames, (f, f); ``order``:
+    index into `ORDERS`.
     """
     series: dict[bytes, tuple[IntArray, list[FloatArray]]] = {}
     for one in np.unique(marker):
@@ -292,6 +297,7 @@ def _of_markers(
 
 
 def _natural_of_markers(logs: FloatArray) -> tuple[float, float]:
+    """Share of the process, and scale of its lengths from 0.1 to 10, from (2,): logit and log."""
     share = float(np.clip(1.0 / (1.0 + np.exp(-logs[0])), *RANGE_SHARE))
     return share, float(np.clip(np.exp(logs[1]), 0.1, 10.0))
 
@@ -299,7 +305,10 @@ def _natural_of_markers(logs: FloatArray) -> tuple[float, float]:
 def _distance(
     position: FloatArray, turn: FloatArray, length_m: float, length_rad: float
 ) -> FloatArray:
-    """Distances of poses in lengths of the process, (f, f)."""
+    """Distances of f poses in lengths of the process, (f, f).
+
+    ``position``: m, (f, 3); ``turn``: rotation matrices, (f, 9); lengths in m and rad.
+    """
     # A rotation by a small angle moves the columns of its matrix by sqrt(2) times it in all.
     place = np.concatenate((position / length_m, turn / (np.sqrt(2.0) * length_rad)), axis=1)
     square = np.sum(place**2, axis=1)
@@ -308,7 +317,10 @@ def _distance(
 
 
 def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
-    """Correlations by distances in lengths of the process, (f, f)."""
+    """Correlations by distances in lengths of the process, (f, f), with 1 on the diagonal.
+
+    ``share``: of the process in the variance; ``order``: index into `ORDERS`.
+    """
     d = np.sqrt(2.0 * min(ORDERS[order], 2.5)) * distance
     if ORDERS[order] == np.inf:
         process = np.exp(-0.5 * distance**2)
@@ -334,5 +346,5 @@ def _inverse_factor(correlations: FloatArray) -> FloatArray:
 
 
 def scatterless(correlations: FloatArray) -> float:
-    """Share of the variance that is common to all errors."""
+    """Share of the variance that is common to all errors: the mean correlation, at most 0.999."""
     return min(float(np.mean(correlations)), 0.999)

@@ -54,12 +54,12 @@ class Posterior:
         reference: FloatArray,
         split: Sequence[int] = (),
     ) -> Posterior:
-        """Posterior of a model.
+        """Posterior of a model by n rows and priors.
 
-        ``split``: sensors with separate noise along and across their line of sight.
-
-        A channel of a sensor with several frames at some pose has a pose_sigma, one with several
-        markers in some frame a frame_sigma.
+        ``free``: indices of the parameters that are not held, (f,); ``reference``: pinned
+        parameters near the mode, (size,); ``split``: sensors with separate noise along and across
+        their line of sight. A channel of a sensor with several frames at some pose has a
+        pose_sigma, one with several markers in some frame a frame_sigma.
         """
         noise_model = NoiseModel.of(rows, model.reference, split)
         return cls(model, tuple(priors), free, reference, noise_model)
@@ -71,7 +71,7 @@ class Posterior:
 
     @property
     def noise_names(self) -> tuple[str, ...]:
-        """Names of the sensors, then of the orientations of those that measure them."""
+        """Names of the sensors, then '<sensor>.orientation' of those that measure orientations."""
         names = self.model.sensor_names
         return (*names, *(f'{names[sensor]}.orientation' for sensor in self.rows.turning))
 
@@ -86,12 +86,12 @@ class Posterior:
 
     @property
     def size(self) -> int:
-        """Length of a point."""
+        """Length d of a point: free parameters, then noise coordinates."""
         noise = self.noise_model
         return len(self.free) + len(noise.channels) + len(noise.shares)
 
     def parameters(self, points: FloatArray) -> FloatArray:
-        """Pinned parameters (..., size of the model) of points (..., d)."""
+        """Pinned parameters (..., size of the model) of points (..., d), with the held ones."""
         z = np.broadcast_to(self.reference, (*points.shape[:-1], self.model.size)).copy()
         z[..., self.free] = points[..., : len(self.free)]
         return z
@@ -108,7 +108,7 @@ class Posterior:
         return self.noise_model.variances(self.noise(eta))
 
     def log_noise_prior(self, eta: FloatArray) -> FloatArray:
-        """Log prior density (...) of noise coordinates (..., e)."""
+        """Log prior density (...) of noise coordinates (..., e), up to a constant."""
         count = len(self.noise_model.channels)
         # A half-normal wall at the resolution instead of a jump: as good as one pseudo-reading.
         wall = 0.5 * np.sum((RESOLUTION_M * np.exp(-eta[..., :count])) ** 2, axis=-1)
@@ -122,7 +122,10 @@ class Posterior:
         return np.all(ratios >= 0.0, axis=-1)
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """Log posterior density (...) of points (..., d), up to a constant."""
+        """Log posterior density (...) of points (..., d), up to a constant; -inf outside.
+
+        Computed in blocks of draws, so that memory does not grow with their number.
+        """
         flat = points.reshape(-1, points.shape[-1])
         block = max(1, BLOCK_ROWS // len(self.rows))
         parts = [self._log_density(flat[i : i + block]) for i in range(0, len(flat), block)]

@@ -36,7 +36,7 @@ class NoiseMixture:
 
     @classmethod
     def of(cls, mode: Mode, rng: np.random.Generator) -> NoiseMixture:
-        """Mixture over draws of the noise.
+        """Mixture over 256 draws of the noise (`NOISE_DRAWS`) about a mode.
 
         The weights are the density of the noise with the parameters integrated out, over that of
         the draws.
@@ -114,17 +114,15 @@ class Precision:
     def joint_rms(self) -> float:
         """Root mean square of the standard deviations of identifiable joints, rad.
 
-        Infinite without any.
-
-        That of a joint that slides is divided by `SerialChain.per_radian`.
+        Infinite without any. That of a joint that slides is divided by `SerialChain.per_radian`.
         """
         return self._joint_rms(self.covariance)
 
     @property
     def tool_rms(self) -> float:
-        """Root mean square of the 3-D error of the predicted markers, m.
+        """Root mean square of the 3-D error of the predicted markers by the parameters, m.
 
-        Infinite without markers.
+        Over the counted rows; infinite without any.
         """
         return self._tool_rms(self.covariance)
 
@@ -141,6 +139,7 @@ class Precision:
         return float(np.sqrt(np.mean(variances))) if variances else np.inf
 
     def _tool_rms(self, covariance: FloatArray) -> float:
+        """Root mean square of the markers' error by a covariance (f, f), m; inf without any."""
         return np.inf if self.tool is None else float(np.sqrt(np.sum(covariance * self.tool)))
 
     def shortfall(self, joint_std: float | None, tool_std: float | None) -> float:
@@ -162,8 +161,9 @@ class Precision:
     def times_the_data(self, joint_std: float | None, tool_std: float | None) -> float:
         """Factor on the data with which the wanted precision is reached; 1 if it is reached.
 
-        Infinite if no amount of data reaches it. Further configurations are assumed to be as
-        informative as the present ones on average.
+        Infinite if 10,000 times the data (`MOST_TIMES`) do not reach it. Further configurations
+        are assumed to be as informative as the present ones on average. ``joint_std, tool_std``:
+        as of `shortfall`.
         """
         information = np.linalg.inv(self.covariance)
         data = information - self.prior

@@ -75,10 +75,11 @@ class Predictive:
 def random_configurations(
     model: Model, seen: Measurements, count: int, rng: np.random.Generator
 ) -> Measurements:
-    """Rows at joint configurations drawn uniformly within the joint limits.
+    """Rows at ``count`` joint configurations drawn uniformly within the joint limits.
 
     Neither collisions nor lines of sight are checked: the whole workspace counts, as in the paper.
-    The rows go through the sensors in turn, each with its marker in ``seen``.
+    The rows go through the sensors in turn, each with its first marker in ``seen``; each is a pose
+    of its own. Measured columns are those of the first row of ``seen`` and without meaning.
     """
     followed = [seen.marker[np.flatnonzero(seen.sensor == s)[0]] for s in np.unique(seen.sensor)]
     sensor = np.arange(count) % len(followed)
@@ -107,7 +108,10 @@ class PredictedAccuracy(NamedTuple):
 def predicted_accuracy(
     predictive: Predictive, seen: Measurements, count: int, rng: np.random.Generator
 ) -> PredictedAccuracy:
-    """Invariant accuracy at random configurations; see `random_configurations`."""
+    """Invariant accuracy at ``count`` random configurations (`random_configurations`).
+
+    Marker positions by the estimate and their mean distances to those by draws of the posterior.
+    """
     core = predictive.without_extension()
     m = random_configurations(core.model, seen, count, rng)
     taken = rng.permutation(len(core.draws))[: max(1, PAIRS // count)]
@@ -137,7 +141,7 @@ def tool_places(
 ) -> ToolPlaces:
     """Positions of the marker at the configuration of a row, by draws; the paper's version.
 
-    ``count``: largest number of draws.
+    ``seen``: measurements; ``row``: index of the row; ``count``: largest number of draws.
     """
     core = predictive.without_extension()
     model, taken = core.model, rng.permutation(len(core.draws))[:count]
@@ -190,7 +194,10 @@ def _block(
     taken: IntArray,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Both versions of the four `Distances` of some rows and draws, m, (2, 4, pairs)."""
+    """Both versions of the four `Distances` of some rows and draws, m, (2, 4, pairs).
+
+    ``before``: pinned parameters with offsets at zero, (size,); ``taken``: indices of the draws.
+    """
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]
     predicted = model.seen(predictive.after, rows)
@@ -218,7 +225,10 @@ def _block(
 
 
 def _distances_between(places: FloatArray, others: FloatArray) -> FloatArray:
-    """Distances between points (..., 3), m, flattened; three times as fast as `norm`."""
+    """Distances between points (..., 3) and others, which broadcast, m, flattened.
+
+    Three times as fast as `numpy.linalg.norm`.
+    """
     shift = places - others
     distances: FloatArray = np.sqrt(np.einsum('...i,...i->...', shift, shift))
     return distances.ravel()

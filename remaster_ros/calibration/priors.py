@@ -54,7 +54,10 @@ class Prior:
 
 
 def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -> Prior:
-    """Prior of a marker: near its nominal position, m, with standard deviation std_m per axis."""
+    """Prior of a marker: near its nominal position in T, m, with std_m per axis, at least 1 µm.
+
+    ``marker``: its index in the model.
+    """
     where = model.marker(marker)
     width = max(std_m, TIGHTEST_PRIOR)
     return Prior(
@@ -64,7 +67,10 @@ def marker_prior(model: Model, marker: int, nominal: FloatArray, std_m: float) -
 
 
 def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
-    """Prior of a joint's offset, rad or m."""
+    """Gaussian prior of a joint's offset, rad, or m for a slide; a std below 1e-6 counts as that.
+
+    ``joint``: index from 0.
+    """
     width = max(std, TIGHTEST_PRIOR)
     shown = f'{1e3 * std:g} mm' if model.chain.slides[joint] else f'{np.degrees(std):g} deg'
     return Prior(
@@ -74,9 +80,10 @@ def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
 
 
 def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
-    """Prior of joint offsets of some degrees at most, `OFFSET_STD`.
+    """Gaussian prior about 0 of joint offsets (indices), std 5 degrees (`OFFSET_STD`).
 
-    With effects in the model: a prior near the offsets with which the effects were searched.
+    22 mm for a joint that slides. With effects in the model: about the offsets with which the
+    effects were searched, with ``step_std`` of the extension.
     """
     indices = list(joints)
     effects, per_radian = model.extension, model.chain.per_radian[indices]
@@ -95,7 +102,11 @@ def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
 
 
 def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
-    """Prior of a sensor's registration T_R_N: six residuals in standard deviations."""
+    """Prior of a sensor's registration T_R_N: six residuals in standard deviations.
+
+    Translation and rotation vector along and about the axes of R; stds are at least 1e-6.
+    ``sensor``: its index.
+    """
     known = matrix_from_quaternion_xyzw(prior.rotation_xyzw)
     widths = max(prior.std_m, TIGHTEST_PRIOR), max(prior.std_rad, TIGHTEST_PRIOR)
 
@@ -111,9 +122,11 @@ def base_prior(model: Model, sensor: int, prior: BasePrior) -> Prior:
 def prior_rows(
     model: Model, priors: Sequence[Prior], z: FloatArray, *, natural: bool = False
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (m,) of all priors, and their derivative (m, size) at z, by numerical differences.
+    """Residuals (m,) of all priors, and their derivative (m, size) at z (size,).
 
-    ``natural``: whether z and the derivative are in natural instead of pinned coordinates.
+    Derivatives by central differences of 1e-6; the last rows are the extension's prior on theta,
+    exactly. ``natural``: whether z and the derivative are in natural instead of pinned
+    coordinates.
     """
     # Priors are on the core; theta's is linear, so differences would only cost.
     step, core = 1e-6 * np.eye(model.core, model.size), model.core

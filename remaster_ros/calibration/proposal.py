@@ -103,6 +103,7 @@ class AdaptedProposal:
 
     @property
     def _tail(self) -> StudentT:
+        """Part with wide tails: 1.3 times as wide (`TAIL_WIDENING`), with 5 degrees of freedom."""
         return StudentT(self.centre.mean, TAIL_WIDENING * self.centre.factor, TAIL_FREEDOM)
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -115,15 +116,16 @@ class AdaptedProposal:
         return np.concatenate(points), np.concatenate(density)
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """Normalised log density (n,) of points (n, d)."""
+        """Normalised log density (n,) of points (n, d) in the posterior's coordinates."""
         blocks = np.array_split(points, max(1, len(points) // self._block))
         parts = [self._inner(block) for block in blocks]
         return np.concatenate([self._log_density(inner) + volume for inner, volume, _ in parts])
 
     def linearised(self, points: FloatArray) -> FloatArray:
-        """Log density of the linearised posterior (n,), up to a constant.
+        """Log density of the linearised posterior (n,) at points (n, d), up to a constant.
 
-        The cost does not depend on the number of observations.
+        -inf if a common part of the noise is negative or a noise coordinate over 5 from the mode
+        (`FARTHEST`). The cost does not depend on the number of observations.
         """
         eta = points[:, self.dimension - len(self.mode.eta) :]
         blocks = np.array_split(points, max(1, len(points) // self._block))
@@ -142,7 +144,7 @@ class AdaptedProposal:
         return self._points(self.centre.mean + 2.0 * (inner - self.centre.mean))[0]
 
     def adapted(self, drawn: Weighted) -> AdaptedProposal:
-        """Proposal with the mean and covariance of weighted draws."""
+        """Proposal with the mean and covariance of weighted draws, tempered if too few."""
         weight = drawn.with_moments()
         inner = self._inner(drawn.points)[0]
         mean = weight @ inner
@@ -153,9 +155,9 @@ class AdaptedProposal:
         )
 
     def _points(self, inner: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points of inner coordinates (n, d), and their log density.
+        """Points (n, d) of inner coordinates (n, d), and their log density (n,).
 
-        Negative common parts of the noise are mirrored at zero.
+        Negative common parts of the noise are mirrored at zero, in ``inner`` itself too.
         """
         inner[:, self.dimension - self._shares :] = np.abs(
             inner[:, self.dimension - self._shares :]
@@ -167,9 +169,9 @@ class AdaptedProposal:
         return points, self._log_density(inner) + log_determinant(factor)
 
     def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Inner coordinates (n, d) of points, the log of the volume ratio.
+        """Inner coordinates (n, d) of points (n, d), and the log of the volume ratio (n,).
 
-        Last result: the marginal log density of the noise.
+        Last result: the marginal log density of the noise, (n,).
         """
         parameters, eta = np.split(points, [self.dimension - len(self.mode.eta)], axis=1)
         mean, factor, marginal = self._conditional(eta)
@@ -184,7 +186,7 @@ class AdaptedProposal:
 
     @property
     def _block(self) -> int:
-        """Number of draws in a block: each draw has a matrix."""
+        """Number of draws in a block, at least 1: each draw has a matrix (d, d)."""
         return max(1, BLOCK_ENTRIES // self.dimension**2)
 
     def _log_density(self, inner: FloatArray) -> FloatArray:
@@ -218,7 +220,10 @@ class Weighted(NamedTuple):
 
     @classmethod
     def of(cls, points: FloatArray, log_weight: FloatArray) -> Weighted:
-        """Draws with smoothed weights."""
+        """Draws (n, d) with smoothed weights from their log weights (n,).
+
+        A log weight of -inf counts as 100 below the least finite one.
+        """
         finite = np.isfinite(log_weight)
         # Draws with zero density get a negligible weight.
         least = np.min(log_weight[finite], initial=0.0) - 100.0
@@ -228,11 +233,15 @@ class Weighted(NamedTuple):
 
     @property
     def effective(self) -> float:
-        """Effective number of independent draws."""
+        """Effective number of independent draws of the smoothed weights, 1 to n."""
         return _effective(self.weight)
 
     def with_moments(self) -> FloatArray:
-        """Weights (n,), tempered until the draws suffice for mean and covariance."""
+        """Weights (n,) with sum 1, tempered until the draws suffice for mean and covariance.
+
+        Suffice: 5 effective draws for each dimension (`DRAWS_PER_DIMENSION`); the weights are
+        raised to powers from 0.7 down, the lowest being 0.7^24.
+        """
         weight = self.weight
         for power in POWERS:
             if _effective(weight) >= DRAWS_PER_DIMENSION * self.points.shape[1]:
@@ -293,6 +302,9 @@ def _effective(weight: FloatArray) -> float:
 
 
 def _factor(covariance: FloatArray) -> FloatArray:
-    """Cholesky factor of a covariance with units of very different size."""
+    """Lower Cholesky factor (d, d) of a covariance with units of very different size.
+
+    Raises numpy.linalg.LinAlgError if it is not positive definite.
+    """
     unit = np.sqrt(np.diag(covariance))
     return unit[:, None] * np.asarray(np.linalg.cholesky(covariance / np.outer(unit, unit)))

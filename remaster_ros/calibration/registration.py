@@ -126,7 +126,10 @@ def register_ransac(
 
 
 def _require_width(points: FloatArray, frame_name: str) -> None:
-    """Raises InsufficientDataError if the points are on one line or in one place."""
+    """Raise InsufficientDataError if points (n, 3) are on one line or in one place.
+
+    That is a spread across their best line of at most 2 % of that along it (`MINIMUM_WIDTH`).
+    """
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
     length, width = spread[:2]
     if not width > MINIMUM_WIDTH * length:

@@ -77,7 +77,7 @@ class StructureTest(Struct, frozen=True):
 
     @property
     def chance(self) -> str:
-        """Probability by chance as text."""
+        """Probability by chance as text: 'p = 0.0123', or 'p < 0.0001'."""
         return 'p < 0.0001' if self.p_value < 1e-4 else f'p = {self.p_value:.4f}'
 
     def words(self, timed: bool = True) -> str:
@@ -113,7 +113,7 @@ class ResidualStructure:
 
     @property
     def found(self) -> tuple[StructureTest, ...]:
-        """Significant tests, the smallest p-value first."""
+        """Significant tests, smallest p-value first: p below 0.01 over the number of tests."""
         limit = FAMILY_WISE_ERROR / max(1, len(self.tests))
         return tuple(
             sorted((t for t in self.tests if t.p_value < limit), key=lambda test: test.p_value)
@@ -121,7 +121,10 @@ class ResidualStructure:
 
 
 def errors_are_left(checks: Sequence[NoiseCheck], structure: ResidualStructure | None) -> bool:
-    """Whether the residuals have structure, or exceed the known noise."""
+    """Whether the residuals have structure, or exceed the known noise of a sensor.
+
+    ``structure``: None if it was not tested.
+    """
     unexplained = any(check.explained is False for check in checks)
     return unexplained or (structure is not None and bool(structure.found))
 
@@ -129,8 +132,9 @@ def errors_are_left(checks: Sequence[NoiseCheck], structure: ResidualStructure |
 def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStructure:
     """Tests of the residuals of a fit at its mode.
 
-    ``mode``: of the posterior of the fitted rows; ``measurements``: source of the rows, whose
-    ``stamp_s`` gives their order.
+    No tests if all noise is below 1 µm (`LEAST_NOISE_M`) or there are fewer than 12 poses of
+    sensors. ``mode``: of the posterior of the fitted rows; ``measurements``: source of the rows,
+    whose ``stamp_s`` gives their order.
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)
@@ -169,7 +173,10 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
 
 
 def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArray]:
-    """Functions of every driver, of each sensor separately, and of every degree."""
+    """Functions of every driver, of each sensor separately, and of every degree, (n, 3, c).
+
+    By `_family_key`; ``seconds``: times of the rows, (n,).
+    """
     names = mode.linearisation.posterior.model.sensor_names
     families = {
         _family_key('joint_angle', '', degree): of_joint_angles(mode, rows, degree)
@@ -191,6 +198,7 @@ def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArr
 
 
 def _family_key(driver: str, sensor: str, degree: int) -> str:
+    """Key of a family in `_families`, '<driver> <degree> <sensor>'; ``sensor`` '' for all."""
     return f'{driver} {degree} {sensor}'
 
 
@@ -207,11 +215,12 @@ def _deviations(columns: FloatArray, middle: FloatArray) -> FloatArray:
 
 
 def _flat(columns: FloatArray) -> FloatArray:
+    """Columns (n, 3, c) as (3 n, c)."""
     return columns.reshape(-1, columns.shape[2])
 
 
 def _basis(columns: FloatArray) -> FloatArray:
-    """Orthonormal basis (n, b) of columns (n, c) of any lengths."""
+    """Orthonormal basis (n, b) of columns (n, c) of any lengths; b is their rank."""
     length = np.linalg.norm(columns, axis=0)
     kept = length > 1e-12 * np.max(length, initial=0.0)
     directions, singular, _ = np.linalg.svd(columns[:, kept] / length[kept], full_matrices=False)
@@ -236,7 +245,8 @@ def _explained(
     """Test whether the columns of a driver explain the remainder (n, 1) after the model's columns.
 
     The columns of the highest degree with enough rows; None if there are too few rows for any
-    degree.
+    degree. ``columns``: by `_family_key`; ``basis``: of the model's columns, (n, b);
+    ``dependent``: how many of the n numbers depend on the others: 0 for means of poses.
     """
     for degree in range(LARGEST[driver], 0, -1):
         found = _f_test(columns[_family_key(driver, sensor, degree)], remainder, basis, dependent)
@@ -276,7 +286,8 @@ def _f_test(
 ) -> Explained | None:
     """Test whether columns (n, c) explain the remainder (n, 1) in addition to a basis (n, b).
 
-    ``dependent``: how many of the n numbers are not independent of the others.
+    None if the basis contains them all, or fewer than 2 degrees of freedom are left for each
+    (`LEAST_REST`). ``dependent``: how many of the n numbers are not independent of the others.
     """
     length = np.linalg.norm(family, axis=0)
     directions, singular, _ = np.linalg.svd(
@@ -342,7 +353,8 @@ def _within_poses(errors: FloatArray, rows: Rows, seconds: FloatArray) -> Struct
     """Test whether the deviation of a reading resembles that of the one before at the same pose.
 
     In random order the sum of the products of neighbours of n deviations d is -Σ d² / n on
-    average; a t test over the poses.
+    average; a t test over the poses with more than two rows, None if they are fewer than 12.
+    ``errors``: deviations in units of the noise, (n, 3).
     """
     group = rows.group_of_row
     order = np.lexsort((seconds, group))

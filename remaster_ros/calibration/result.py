@@ -68,7 +68,7 @@ NOISE_RANGE = (-3.0, 3.0)
 
 
 def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
-    """Standard deviation of each joint's offset with a discrepancy, rad, (k,).
+    """Standard deviation of each joint's offset with a discrepancy, rad or m, (k,).
 
     0 for offsets that are held; never below that of the model. ``mode``: of the posterior of the
     fitted rows; ``measurements``: source of the rows.
@@ -159,7 +159,10 @@ class Orientations:
     information: OrientationInformation | None = None  # Information on the offsets
 
     def words(self, chain: SerialChain, std: FloatArray) -> str:
-        """Effect of the orientations on offsets with standard deviations (k,), a sentence."""
+        """Effect of orientations on the offsets, a sentence; the reason if they are not fitted.
+
+        ``std``: of the offsets by all data, rad or m, (k,); 0 for those that are held.
+        """
         if self.why_not or self.information is None:
             return self.why_not
         noises = ' and '.join(
@@ -292,17 +295,17 @@ class FitResult:
 
     @property
     def comparison(self) -> Comparison:
-        """Fit with all offsets held at zero, compared with this fit."""
+        """Fit with all offsets held at zero, compared with this fit; computed once."""
         return self.compare()
 
     @property
     def clocks(self) -> Mapping[str, tuple[float, float]]:
-        """How late each sensor's stamps are beside the joints', and std, s; {} if none moved."""
+        """Delay of each sensor's stamps to the joints', and its std, s; {} if none moved."""
         return {} if self.found is None else clocks_of(self.found)
 
     @property
     def T_R_N_before(self) -> Mapping[str, FloatArray]:
-        """Registrations of the fit with all offsets held at zero."""
+        """Registrations (4, 4) by sensor of the fit with all offsets held at zero."""
         return self.comparison.T_R_N_before
 
     @property
@@ -312,7 +315,7 @@ class FitResult:
 
     @property
     def accuracy(self) -> Mapping[str, Any]:
-        """The three metrics as fit.json has them."""
+        """The three metrics before and after, by split, as fit.json has them."""
         return self.comparison.accuracy
 
     @property
@@ -330,7 +333,10 @@ class FitResult:
 
     @property
     def implausible(self) -> tuple[str, ...]:
-        """Line for each joint whose offset is identifiable and too large for a mastering."""
+        """Line for each joint whose offset is identifiable and above 5 degrees (`LARGEST_OFFSET`).
+
+        For a joint that slides: above that times ``per_radian``, some 22 mm.
+        """
         return tuple(
             f'{joint}: an offset of {amount} is more than a mastering is off by ({largest}); '
             'before it is used, check joint order, '
@@ -339,7 +345,7 @@ class FitResult:
         )
 
     def _too_large(self) -> list[tuple[str, str, str]]:
-        """Joints with too large an identifiable offset, with offset and limit as text."""
+        """Name, offset and limit as text of each joint with too large an identifiable offset."""
         limit, found = LARGEST_OFFSET * self.chain.per_radian, []
         for i in np.flatnonzero(self.identifiable & (np.abs(self.joint_offsets) > limit)).tolist():
             amount = self.chain.shown_offset(i, self.joint_offsets[i]).replace('deg', 'degrees')
@@ -400,7 +406,10 @@ class Sampled:
     found: Estimate | None = None  # Estimate with this posterior; None if it was not computed
 
     def widened(self, rng: np.random.Generator) -> Sampled:
-        """Same draws with random contributions of causes outside the model."""
+        """Same draws with random contributions of causes outside the model; unchanged without any.
+
+        The mean over all draws stays the same.
+        """
         if self.unmodelled is None:
             return self
         causes = rng.standard_normal((*self.z.shape[:-1], self.unmodelled.shape[1]))
@@ -440,7 +449,11 @@ def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
 def build_result(
     problem: Problem, sampled: Sampled, seconds: float | None, rng: np.random.Generator
 ) -> FitResult:
-    """Summary of the draws; ``seconds``: their computing time; ``rng``: for section V-C."""
+    """Summary of the draws: the result of a fit, with its tests.
+
+    ``seconds``: their computing time, None if it was not taken; ``rng``: for section V-C. The
+    comparison with offsets at zero is computed when it is read.
+    """
     posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
     model = posterior.model
     # In pinned coordinates any value of a joint that is not identifiable fits as well as 0.

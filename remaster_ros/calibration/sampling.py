@@ -72,7 +72,7 @@ class Sampling(NamedTuple):
 
 
 def silent(stage: str, share: float) -> None:
-    """No report of progress."""
+    """Do nothing: progress without a report."""
 
 
 def unchanged(points: FloatArray) -> FloatArray:
@@ -140,7 +140,8 @@ def sample_posterior(
 def gaussian_draws(mode: Mode, chains: int, rng: np.random.Generator) -> Chains:
     """Draws of the Gaussian about the mode, which is the posterior of many linear effects.
 
-    Parameters by the linearised posterior at the mode's noise, the noise by its own curvature.
+    800 for each chain (`GAUSSIAN_DRAWS`): parameters by the linearised posterior at the mode's
+    noise, the noise by its own curvature, both independent.
     """
     count = chains * GAUSSIAN_DRAWS
     parts = []
@@ -158,7 +159,10 @@ def gaussian_draws(mode: Mode, chains: int, rng: np.random.Generator) -> Chains:
 
 
 def _is_linear(proposal: AdaptedProposal, rng: np.random.Generator) -> bool:
-    """Whether the linearised density equals the exact one on draws of it."""
+    """Whether the linearised density equals the exact one on draws of it, up to a constant.
+
+    The differences of the logs span less than 0.1 (twice `DENSITY_ERROR_LIMIT`).
+    """
     posterior = proposal.mode.linearisation.posterior
     count = int(np.clip(CHECKED_ROWS // len(posterior.rows), FEWEST_CHECKED, MOST_CHECKED))
     points, log_proposal = proposal.sample(4 * count, rng)
@@ -177,7 +181,11 @@ def _adapted(
     rng: np.random.Generator,
     report: Progress,
 ) -> tuple[AdaptedProposal, Weighted]:
-    """Best of several proposals, each adapted to draws of the one before."""
+    """Best of up to 8 proposals, each adapted to draws of the one before, with its draws.
+
+    Ends once half of the draws are effective (`GOOD_WEIGHTS`). ``evaluations``: of the density,
+    that are allowed.
+    """
     count = max(ROUND_DRAWS, ROUND_DRAWS_PER_DIMENSION * proposal.dimension)
     rounds = int(np.clip(evaluations // count, 1, ROUNDS))
     best: tuple[AdaptedProposal, Weighted] | None = None

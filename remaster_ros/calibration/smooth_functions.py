@@ -28,7 +28,7 @@ GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
 def evenly(count: int, share: float) -> IntArray:
-    """Indices, from 0 to ``count``, of an even share of a sequence, with the first.
+    """Indices, below ``count`` and ascending, of an even share of a sequence, with the first.
 
     The choice follows multiples of the golden ratio's inverse: the share is the same among every
     second or third element, such as rows of several markers in turn, unlike with every k-th
@@ -38,7 +38,7 @@ def evenly(count: int, share: float) -> IntArray:
 
 
 def spread_poses(rows: Rows) -> Rows:
-    """All rows, or of a large session the rows of evenly spread poses."""
+    """All rows, or of more than 10,000 (`MOST_ROWS`) the rows of evenly spread poses."""
     if len(rows) <= MOST_ROWS:
         return rows
     first = evenly(len(rows.group_start), MOST_ROWS / len(rows))
@@ -57,7 +57,10 @@ def spread_poses(rows: Rows) -> Rows:
 
 
 def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Families of columns (n, 3, c) in units of the noise, with 'errors' and 'model'."""
+    """Families of columns (n, 3, c) in units of the noise at a mode, by name.
+
+    With 'errors' (n, 3, 1) and 'model', the derivative by the free parameters, (n, 3, f).
+    """
     posterior = mode.linearisation.posterior
     model = posterior.model
     columns = {
@@ -96,7 +99,10 @@ def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> Float
 def of_joint_times(
     mode: Mode, rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE
 ) -> FloatArray:
-    """Errors by zero-offsets that change with time, s, (n,): (n, 3, degree k)."""
+    """Errors by zero-offsets that change with time, s, (n,): (n, 3, degree k).
+
+    Blocks of k columns for Legendre polynomials of degree 1 to ``degree``.
+    """
     by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
     functions = _polynomials(seconds, degree)
     return np.concatenate(
@@ -114,8 +120,9 @@ def _polynomials(seconds: FloatArray, degree: int) -> FloatArray:
 def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:
     """Errors by each joint's error as harmonics of its own angle, (n, 3, 2 harmonics k).
 
-    For a joint that slides half a turn is the measured travel: a sine of its position is then as
-    smooth as one of an angle.
+    Blocks of k columns: sine and cosine of the angle, then of its double. For a joint that slides
+    half a turn is the measured travel: a sine of its position is then as smooth as one of an
+    angle.
     """
     model = mode.linearisation.posterior.model
     by_joints = model.inner_pose(mode.z, rows).by_joints
@@ -133,7 +140,11 @@ def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> Float
 
 
 def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
-    """Errors by a displacement and by a tilt of each joint's frame, (n, 3, 3 k) each."""
+    """Errors by a displacement and by a tilt of each joint's frame, (n, 3, 3 k) each.
+
+    Along and about the x, y, z axes of the frame after the joint, m per m and m per rad, joint by
+    joint.
+    """
     model = mode.linearisation.posterior.model
     frames = model.chain.frames(rows.q, model.offsets(mode.z))
     pose = model.inner_pose(mode.z, rows)
@@ -149,7 +160,7 @@ def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
 
 
 def by_sensor(rows: Rows, columns: FloatArray) -> dict[int, FloatArray]:
-    """Functions of position or time for each sensor, by its index."""
+    """Functions of position or time (n, 3, c sensors) for each sensor, by its index."""
     parts = np.split(columns, len(rows.spans), axis=2)
     return {sensor: part for (sensor, _), part in zip(rows.spans, parts, strict=True)}
 
