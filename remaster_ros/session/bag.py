@@ -57,7 +57,11 @@ def jazzy_types() -> Typestore:
 
 
 def live_name(topic: str) -> str:
-    """Return the name that a topic of a bag had when it was recorded."""
+    """Return the name that a topic of a bag had when it was recorded.
+
+    Three topics that move an arm are recorded under other names (`RECORDED`); others are
+    unchanged.
+    """
     return _LIVE.get(topic, topic)
 
 
@@ -126,7 +130,11 @@ class BagReader:
             ) from None
 
     def _types(self, msgtype: str) -> Typestore:
-        """Return the known types, with this one from its definition in the bag if necessary."""
+        """Return the type store that knows a message type.
+
+        Jazzy's own; with types of the bag's definitions added if the type is another one that the
+        bag defines. A type that neither knows gives Jazzy's.
+        """
         if msgtype in jazzy_types().types or msgtype not in self._definitions:
             return jazzy_types()
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -142,9 +150,11 @@ class BagReader:
         return store
 
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
-        """Yield the messages of one of `files`; the first look records where it is cut off.
+        """Yield the messages of one of `files`, in the order recorded.
 
-        Raises InputError if the file is unreadable or damaged.
+        With ``first_look`` the bytes cut off at its end are added to `torn_bytes`, with a warning.
+        `complete` becomes False for a file that a killed writer left. Raises InputError if the
+        file is unreadable or damaged.
         """
         path = self.folder / file.name
         try:
@@ -158,7 +168,11 @@ class BagReader:
             raise _damaged(path, f'{type(error).__name__}: {error}') from None
 
     def _messages_of(self, path: Path, first_look: bool) -> Iterator[BagMessage]:
-        """Yield the messages of a file; see `messages_of`."""
+        """Yield the messages of a file; arguments and effects as of `messages_of`.
+
+        Raises InputError for damage that is no cut-off end; other errors come as the decoder
+        raises them.
+        """
         schemas: dict[int, Schema] = {}
         channels: dict[int, tuple[str, str]] = {}
         size = path.stat().st_size
@@ -214,7 +228,10 @@ class BagReader:
 
 
 def _mcap_files(path: Path) -> list[Path]:
-    """Return the MCAP files of a bag in the order recorded; raise InputError if none."""
+    """Return the MCAP files of a bag, bag_2 before bag_10; a path may be such a file itself.
+
+    Raises InputError if there is no such folder, or it has no .mcap file.
+    """
     if path.is_file() and path.suffix == '.mcap':
         return [path]
     if not path.is_dir():
@@ -231,6 +248,6 @@ def _mcap_files(path: Path) -> list[Path]:
 
 
 def _damaged(path: Path, what: str) -> InputError:
-    """Return the error for a damaged file."""
+    """Return the InputError for a damaged file; ``what``: the damage, cut to 120 characters."""
     what = ' '.join(what.split())[:120]
     return InputError(f'{path}: damaged ({what}); take another copy of the bag')

@@ -39,7 +39,7 @@ class FileMetadata:
     count: int = 0
 
     def add(self, stamp_ns: int) -> None:
-        """Count a message."""
+        """Count a message with a stamp, ns since the epoch, as the last one so far."""
         if self.first_ns is None:
             self.first_ns = stamp_ns
         self.last_ns = stamp_ns
@@ -68,7 +68,10 @@ def all_of(files: list[FileMetadata]) -> FileMetadata:
 
 
 def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) -> str:
-    """Return metadata.yaml for a bag of these MCAP files, in the order recorded."""
+    """Return the text of metadata.yaml (rosbag2 version 9) for a bag of MCAP files.
+
+    ``files``: in the order recorded; ``topics``: with their numbers of messages.
+    """
     information: dict[str, Any] = {
         'version': 9,
         'storage_identifier': 'mcap',
@@ -97,12 +100,18 @@ def metadata_text(files: list[FileMetadata], topics: Iterable[TopicMetadata]) ->
 
 
 def qos_text(latched: bool) -> str:
-    """Return the QoS offered on a topic in the form of the MCAP channel's metadata."""
+    """Return the QoS offered on a topic as YAML, in the form of the MCAP channel's metadata.
+
+    Reliable, depth 10; ``latched``: transient local, else volatile.
+    """
     return dump_yaml(_qos(latched))
 
 
 def _qos(latched: bool) -> list[dict[str, Any]]:
-    """Return the QoS offered on a topic as plain data."""
+    """Return the QoS offered on a topic as plain data, a list of one profile.
+
+    ``latched``: transient local, else volatile.
+    """
     return [
         {
             'history': 'keep_last',

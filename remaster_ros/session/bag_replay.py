@@ -53,12 +53,15 @@ class _Keeper:
         self.journal = journal
 
     def write(self, write: Callable[[], object]) -> None:
+        """Call ``write`` at once; its errors are passed on."""
         write()
 
     def reopen(self, *, go_further: bool = False) -> None:
+        """Continue a stopped session; with ``go_further``, a complete one."""
         self.journal.reopen(go_further=go_further)
 
     def close(self, exit_status: ExitStatus) -> None:
+        """Close the session with an exit status."""
         self.journal.close(exit_status)
 
 
@@ -66,6 +69,7 @@ class _Log(Outlet):
     """Logs warnings and errors of the session recorder."""
 
     def log(self, level: int, text: str) -> None:
+        """Log a line of level warning or above; others are dropped."""
         if level >= logging.WARNING:
             log.log(level, text)
 
@@ -83,12 +87,15 @@ class Replayed:
 
 
 def bag_folder(path: Path) -> Path:
-    """Return the bag at a path, which may be that of its session."""
+    """Return the bag at a path: its subfolder ``bag`` if there is one, else the path itself."""
     return path / 'bag' if (path / 'bag').is_dir() else path
 
 
 def session_beside(bag: Path) -> Path | None:
-    """Return the session that contains a bag; None if there is none."""
+    """Return the session folder that contains a bag (folder or file); None if there is none.
+
+    That is the folder above the bag's, if it has a session.yaml.
+    """
     folder = (bag if bag.is_dir() else bag.parent).absolute().parent
     return folder if (folder / HEADER).exists() else None
 
@@ -99,11 +106,12 @@ def record_from_bag(
     cell: Workcell | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Replayed:
-    """Write the session of a recorder's bag.
+    """Write the session of a recorder's bag into a folder, by the messages in order.
 
     ``out``: the session folder, new or empty; ``cell``: replaces the cell in the bag;
-    ``progress``: called with the share that is done. Raises InputError if the bag is not a
-    recorder's, a message is damaged, or the folder is not empty.
+    ``progress``: called with the share that is done. A session that the bag does not close is
+    closed as stopped. Raises InputError if the bag is not a recorder's or lacks its cell, a
+    message is damaged, or the folder is not empty.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: there is something already; name a new folder for the session')
@@ -137,7 +145,11 @@ def record_from_bag(
 
 
 def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[Any], object]]:
-    """Return the function that takes the messages of each topic."""
+    """Return the function that takes the messages of each topic, by absolute topic name.
+
+    Joint states, settled, joint solutions; for each sensor its temperature and its markers, or the
+    poses in place of the markers if it has them.
+    """
     take: dict[str, Callable[[Any], object]] = {
         '/joint_states': recorder.take_joints,
         '/remaster/settled': recorder.take_settled,
@@ -152,17 +164,20 @@ def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[An
 
 
 def _marker_taker(recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], object]:
-    """Return the function that takes the readings of a marker."""
+    """Return the function that takes the readings of a marker, PointStamped or PoseStamped."""
     return lambda message: recorder.take_marker(sensor, marker, message)
 
 
 def _absolute(topic: str) -> str:
-    """Return an absolute topic name."""
+    """Return a topic name with one leading slash."""
     return f'/{topic.lstrip("/")}'
 
 
 def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]:
-    """Return the event record in a message, in a list; [] for a record of an unknown program."""
+    """Return the event record in a message, in a list; [] with a warning if it is not readable.
+
+    ``kind``: message type; ``data``: serialised message.
+    """
     try:
         return [events.decode(bag.decoded(kind, data).data)]
     except InputError as error:
@@ -188,7 +203,10 @@ def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]
 
 
 def _cell(bag: BagReader, text: str) -> Workcell | None:
-    """Return the cell in a bag; None if it lacks it; raise InputError if it is invalid."""
+    """Return the cell in a bag; None for an empty text.
+
+    ``text``: the cell as JSON. Raises InputError if it is invalid or of another version.
+    """
     if not text:
         return None
     try:
@@ -201,7 +219,10 @@ def _cell(bag: BagReader, text: str) -> Workcell | None:
 
 
 def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
-    """Return the recorder's parameters in the bag, without unknown ones."""
+    """Return the recorder's parameters in the bag; unknown ones are dropped, missing ones default.
+
+    Raises InputError if one is out of range.
+    """
     known = {field.name for field in fields(Parameters)}
     given: dict[str, Any] = {k: v for k, v in began.parameters.items() if k in known}
     p = Parameters(**given)
@@ -212,8 +233,9 @@ def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
 def differences(session: Path, other: Path) -> list[str]:
     """Return the differences between a session and the replay of its bag, one line per row.
 
-    Rows are matched by pose, split, sensor, marker and previous configuration, so that a missing
-    row is reported alone.
+    [] if there are none. Rows are matched by pose, split, sensor, marker and previous
+    configuration, so that a missing row is reported alone; numbers of observation, configuration
+    and frame are not compared. Raises InputError if an observations.csv cannot be read.
     """
     ours, theirs = _rows(session), _rows(other)
     found = []
@@ -234,7 +256,10 @@ def differences(session: Path, other: Path) -> list[str]:
 
 
 def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
-    """Observations of a session by (pose, split, sensor, marker, previous configuration)."""
+    """Observations of a session, column -> text, by pose, split, sensor, marker and last joints.
+
+    A number is added to the key for repeated ones. Raises InputError if the file cannot be read.
+    """
     path = session / ROWS
     data = read_limited(path, OBSERVATIONS_LIMIT, 'it is part of a session')
     found: dict[tuple[str, ...], dict[str, str]] = {}

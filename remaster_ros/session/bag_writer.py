@@ -42,9 +42,9 @@ _WORK = '.recovery'
 
 @cache
 def definition_of(msgtype: str) -> tuple[str, str]:
-    """Return the message definition of one of Jazzy's types and its RIHS01 hash.
+    """Return the message definition of one of Jazzy's types, and its RIHS01 hash.
 
-    Raises InputError for another message type.
+    ``msgtype``: as in 'sensor_msgs/msg/JointState'. Raises InputError for another message type.
     """
     from rosbags.typesys.store import TypesysError
 
@@ -188,7 +188,10 @@ class BagWriter:
         self.close()
 
     def _add_topic(self, topic: str, msgtype: str) -> None:
-        """Register a topic in the file; raise InputError if its type is unknown."""
+        """Register a topic in the file and list it in metadata.yaml.
+
+        Raises InputError if its type is not one of ROS 2 Jazzy's.
+        """
         definition, type_hash = definition_of(msgtype)
         if msgtype not in self._schemas:
             self._schemas[msgtype] = self._writer.register_schema(
@@ -203,7 +206,10 @@ class BagWriter:
         self._list_topics()
 
     def _list_topics(self) -> None:
-        """Write metadata.yaml with the topics, which players need, before the bag is closed."""
+        """Write metadata.yaml with the topics, which players need, before the bag is closed.
+
+        If the disk is full, it is written later (``_metadata_waits``).
+        """
         try:
             self._write_metadata()
             self._metadata_waits = False
@@ -211,6 +217,7 @@ class BagWriter:
             self._metadata_waits = True
 
     def _write_metadata(self) -> None:
+        """Write metadata.yaml with the files and topics so far; raise DiskError if that fails."""
         text = metadata_text(self._files, self._topics.values())
         write_atomically(self.folder / METADATA_FILE, text)
 
@@ -218,7 +225,9 @@ class BagWriter:
 def recover_bag(folder: str | os.PathLike[str]) -> str:
     """Finish the bag of a killed writer, so that every MCAP and rosbag2 reader opens it.
 
-    Returns what was lost, as text; '' for nothing. A closed bag is unchanged.
+    The last file is written anew up to its last whole message; metadata.yaml and SHA256SUMS are
+    completed. Returns what was lost, as text; '' for nothing. A closed bag is unchanged. Raises
+    InputError if there is no bag or it is damaged, DiskError if the folder cannot be written to.
     """
     folder = Path(folder)
     remove_leftovers(folder)
@@ -248,7 +257,10 @@ def recover_bag(folder: str | os.PathLike[str]) -> str:
 
 
 def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
-    """Return the topics of a bag by name."""
+    """Return the metadata of a bag's topics, with their numbers of messages, by name.
+
+    Raises InputError for a message type that is not one of ROS 2 Jazzy's.
+    """
     return {
         topic: _described(topic, msgtype, reader.counts[topic])
         for topic, msgtype in reader.topics.items()
@@ -256,7 +268,10 @@ def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
 
 
 def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
-    """Return the metadata of a topic."""
+    """Return the metadata of a topic with this number of messages.
+
+    Raises InputError for a message type that is not one of ROS 2 Jazzy's.
+    """
     _, type_hash = definition_of(msgtype)
     return TopicMetadata(topic, msgtype, type_hash, topic in LATCHED_TOPICS, count)
 
@@ -273,7 +288,10 @@ def _remove_work(folder: Path) -> None:
 
 
 def _remove_beginnings(folder: Path) -> None:
-    """Remove the files of a writer that was killed before its first file was complete."""
+    """Remove the files of a writer that was killed before its first file was complete.
+
+    Temporary files, and metadata.yaml if it is alone; other folders are unchanged.
+    """
     if folder.is_dir():
         remove_leftovers(folder)
         if [path.name for path in folder.iterdir()] == [METADATA_FILE]:

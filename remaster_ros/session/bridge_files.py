@@ -27,7 +27,11 @@ class _Halt(msgspec.Struct):
 
 
 def bridge_file(kind: str, node: str, environment: Mapping[str, str]) -> Path:
-    """Return the path of a bridge's state file, by its fully qualified name and the ROS domain."""
+    """Return the path of a bridge's state file: ROS_HOME/remaster_ros/KIND_DOMAIN_NODE.json.
+
+    ``kind``: 'halt' or 'command'; ``node``: fully qualified name; ``environment``: has ROS_HOME
+    (by default ~/.ros) and ROS_DOMAIN_ID (by default 0).
+    """
     home = Path(environment.get('ROS_HOME') or Path.home() / '.ros')
     # Names of nodes have no dot, so that /a/b and /a_b get different files.
     name = node.strip('/').replace('/', '.')
@@ -46,7 +50,10 @@ class HaltFile:
         self.path = bridge_file('halt', node, environment)
 
     def read(self) -> str:
-        """Return the reason of the halt, '' if there is none; a damaged file counts as a halt."""
+        """Return the reason and time of the halt as text, '' if there is none.
+
+        A file that is damaged or cannot be read counts as a halt.
+        """
         try:
             if not self.path.exists():
                 return ''
@@ -58,13 +65,13 @@ class HaltFile:
         return f'{halt.halted} (halted {halt.since}, before this bridge was started)'
 
     def write(self, reason: str) -> None:
-        """Store a halt; raise RemasterError if the file cannot be written."""
+        """Store a halt and the present time, durably; raise DiskError if that is impossible."""
         make_folder(self.path.parent)
         since = datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S UTC')
         write_atomically(self.path, msgspec.json.encode(_Halt(reason, since)))
 
     def clear(self) -> None:
-        """Remove the halt; raise OSError if the file cannot be removed."""
+        """Remove the halt durably, if there is one; raise OSError if that is impossible."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             sync_folder(self.path.parent)
@@ -92,7 +99,7 @@ class LastCommand:
 
     @property
     def places(self) -> FloatArray | None:
-        """Places between which the arm was led, rad, (n, k); None if unknown."""
+        """Ends between which the arm was led, rad or m, (1 or 2, k); None if unknown."""
         ends = [end for end in (self.end, self.next_end) if end is not None]
         return None if self.end is None else np.array(ends)
 
@@ -111,7 +118,11 @@ class LastCommandFile:
         self._joints = list(joints)
 
     def read(self, now_ns: int) -> LastCommand | None:
-        """Return the last command, aged to `now_ns` (ns since 1970); None if there was none."""
+        """Return the last command, aged to ``now_ns`` (ns since 1970); None if there was none.
+
+        A damaged file gives an unknown end and an infinite age; other joints an unknown end. The
+        age is infinite if the command is later than now.
+        """
         try:
             if not self.path.exists():
                 return None
@@ -129,7 +140,11 @@ class LastCommandFile:
         return LastCommand(end, age_s, following)
 
     def write(self, end: FloatArray, sent_ns: int, next_end: FloatArray | None = None) -> None:
-        """Store the end of a command; raise RemasterError if the file cannot be written."""
+        """Store the end of a command, rad or m, (k,), durably; raise DiskError if that fails.
+
+        ``sent_ns``: time it was sent, ns since 1970; ``next_end``: end of the next piece of its
+        move.
+        """
         make_folder(self.path.parent)
         write_atomically(
             self.path,
@@ -145,4 +160,5 @@ class LastCommandFile:
 
 
 def _is_place(values: Sequence[float], joints: int) -> bool:
+    """Whether values are finite numbers, one for each joint."""
     return len(values) == joints and bool(np.isfinite(values).all())

@@ -61,7 +61,10 @@ class CellProposal:
 
 
 def rail_advice(before: Sequence[str], base_link: str) -> str:
-    """Return advice to leave joints before the arm, one or more such as a rail, where they are."""
+    """Return advice, a sentence, to leave joints before the arm, such as a rail, where they are.
+
+    ``before``: names of these joints, at least one; ``base_link``: where the arm begins.
+    """
     return (
         f'{", ".join(before)} carries the whole arm, and is no joint of it here: leave it where '
         f'it is until everything is measured; the result is of the arm from {base_link} on'
@@ -69,7 +72,7 @@ def rail_advice(before: Sequence[str], base_link: str) -> str:
 
 
 def cell_text(p: CellProposal) -> str:
-    """Return the YAML text of a cell file."""
+    """Return the YAML text of a cell file, with a comment on every key that needs a check."""
     chain, ranges = p.chain, p.ranges
     others = ', '.join(tip for tip in p.tips if tip != chain.tip_link)
     limits = ', '.join(
@@ -153,7 +156,7 @@ def cell_text(p: CellProposal) -> str:
 
 
 def _held_lines(p: CellProposal) -> list[str]:
-    """Return the lines of the held joint."""
+    """Return the lines of the held joint: its name, values and reason; '' if none is held."""
     held, chain = p.held, p.chain
     if held.joint is None:
         text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
@@ -179,7 +182,7 @@ def _held_lines(p: CellProposal) -> list[str]:
 
 
 def _sensor_lines(name: str, p: CellProposal) -> list[str]:
-    """Return the lines of a sensor."""
+    """Return the lines of a sensor of `SENSORS`, with the proposed place and viewing angle."""
     sensor, place, angle = SENSORS[name], p.sensor_R, p.max_angle_deg[name]
     why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'
     if angle > sensor.max_angle_deg:
@@ -210,12 +213,12 @@ def _mesh_lines(p: CellProposal) -> list[str]:
 
 
 def _comment(text: str) -> list[str]:
-    """Return a text as comment lines."""
+    """Return a text as comment lines of at most 99 columns."""
     return [f'# {line}' for line in wrap(text, 97, break_long_words=False)]
 
 
 def _value(value: str | float | bool | None) -> str:
-    """Return a value as YAML, quoted if necessary."""
+    """Return a value as YAML: plain text if it is read back as that text, else as JSON."""
     if isinstance(value, str) and _PLAIN.fullmatch(value) and load_yaml(value) == value:
         return value
     return json.dumps(value)

@@ -44,16 +44,20 @@ def undone_on_failure() -> Iterator[None]:
 
 
 def made_if_new(path: Path) -> None:
-    """Register a file or folder that is about to be made, for `undone_on_failure`."""
+    """Register a file or folder that is about to be made, for `undone_on_failure`.
+
+    Nothing happens if the path exists, or outside of `undone_on_failure`.
+    """
     made = _MADE.get()
     if made is not None and not os.path.lexists(path):
         made.append(path)
 
 
 def read_limited(path: Path, limit: int, missing: str) -> bytes:
-    """Read a regular file of at most `limit` bytes; raise InputError if that is impossible.
+    """Read a regular file of at most ``limit`` bytes.
 
-    ``missing``: remedy at the end of the message if there is no such file.
+    ``missing``: remedy at the end of the message if there is no such file. Raises InputError if
+    the file is missing, not regular, unreadable or larger.
     """
     try:
         if not path.exists():
@@ -77,7 +81,7 @@ class _CpuTimeUsedUp(BaseException):
 
 @contextlib.contextmanager
 def cpu_limited(limit_s: float, refusal: str) -> Iterator[None]:
-    """Raise InputError with the text `refusal` if the body takes more processor time, s.
+    """Raise InputError with the text ``refusal`` if the body takes over limit_s of processor time.
 
     A signal interrupts the body, also within a regular expression. Signals reach the main thread
     only: in any other thread there is no limit.
@@ -114,7 +118,10 @@ def refuse_utf16(data: bytes, path: Path) -> None:
 
 
 def decode_text(data: bytes, path: Path) -> str:
-    """Decode UTF-8, with or without a byte order mark; an InputError names the line."""
+    """Decode UTF-8, with or without a byte order mark.
+
+    Raises InputError, which names file and line, for other bytes, or for UTF-16.
+    """
     refuse_utf16(data, path)
     try:
         return data.decode('utf-8-sig')
@@ -124,7 +131,10 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Create an output folder with its parents, durably; raise InputError if impossible."""
+    """Create an output folder with its parents, durably, unless it exists.
+
+    Raises DiskError if that is impossible.
+    """
     with writing(folder):
         new = [path for path in (folder, *folder.parents) if not path.exists()]
         for path in reversed(new):
@@ -136,7 +146,10 @@ def make_folder(folder: Path) -> None:
 
 
 def make_new_folder(folder: Path) -> None:
-    """Create an output folder, or accept an empty one; raise InputError if it has files."""
+    """Create an output folder, or accept an empty one.
+
+    Raises InputError if it has files, DiskError if it cannot be made.
+    """
     make_folder(folder)
     with writing(folder):
         occupied = any(folder.iterdir())
@@ -171,7 +184,10 @@ def write_atomically(path: Path, data: str | bytes | bytearray) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of atomic writes that a crash interrupted."""
+    """Remove temporary files (.*.tmp) of atomic writes that a crash interrupted.
+
+    Raises DiskError if one cannot be removed.
+    """
     for path in sorted(folder.glob('.*.tmp')):
         with writing(path):
             os.unlink(path)
@@ -225,7 +241,11 @@ class AppendFile:
         self.size += len(data)
 
     def truncate(self, size: int) -> None:
-        """Truncate the file durably; raise InputError if that fails."""
+        """Truncate the file to a number of bytes, durably.
+
+        Raises DiskError if that fails; the file is then closed. InputError if it is closed
+        already.
+        """
         try:
             os.ftruncate(self.descriptor, size)
             os.fsync(self.descriptor)
@@ -261,7 +281,7 @@ class PatientFile:
         return len(self._waiting)
 
     def write(self, data: bytes) -> int:
-        """Accept a piece; return its length."""
+        """Accept a piece and return its length; it waits in memory if the disk is full."""
         self._waiting += data
         self._given += len(data)
         with contextlib.suppress(DiskError):
@@ -269,7 +289,7 @@ class PatientFile:
         return len(data)
 
     def tell(self) -> int:
-        """Return the number of bytes accepted."""
+        """Return the number of bytes accepted, waiting ones included."""
         return self._given
 
     def flush(self) -> None:
@@ -279,7 +299,7 @@ class PatientFile:
                 del self._waiting[: os.write(self._descriptor, self._waiting)]
 
     def close(self) -> None:
-        """Write the waiting bytes durably; raise DiskError if that fails."""
+        """Write the waiting bytes durably and close the file; raise DiskError if that fails."""
         try:
             self.flush()
             with writing(self.path):
@@ -289,14 +309,17 @@ class PatientFile:
 
 
 def write_all(descriptor: int, data: bytes | bytearray) -> None:
-    """Write all of `data`, with as many system calls as necessary."""
+    """Write all of ``data`` to a file descriptor; raise OSError if that fails."""
     written = 0
     while written < len(data):
         written += os.write(descriptor, data[written:])
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable: otherwise a power cut may lose that of a new file."""
+    """Make the names in a folder durable: otherwise a power cut may lose that of a new file.
+
+    Raises OSError if that fails.
+    """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -306,7 +329,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert an error of the operating system to a DiskError that names path and remedy."""
+    """Convert an OSError of the body to a DiskError that names ``path`` and the remedy."""
     try:
         yield
     except OSError as error:
@@ -322,5 +345,5 @@ def cannot_write(path: Path, error: OSError) -> DiskError:
 
 
 def reason(error: Exception) -> str:
-    """Return the text of an error of the operating system, without the path."""
+    """Return an error of the operating system as text without the path."""
     return getattr(error, 'strerror', None) or str(error)

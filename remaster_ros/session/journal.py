@@ -68,9 +68,10 @@ class Journal:
         return os.fstat(self._file.descriptor).st_nlink
 
     def restore(self) -> None:
-        """Write every record again if the file on the disk is not the open one any more.
+        """Write every record again into the file's name, if the open file has lost that name.
 
-        Raises InputError if another process writes the file on the disk.
+        Raises InputError if another process writes the file on the disk, DiskError if the disk is
+        full.
         """
         write_atomically(self.path, self.content)
         self._file.close()
@@ -89,14 +90,21 @@ class Journal:
                 ) from None
 
     def append(self, record: Record) -> None:
-        """Append one record durably; after a DiskError the file is as before."""
+        """Append one record durably; it is added to `records` and `content`.
+
+        Raises DiskError if the disk is full; the file is then as before. ValueError for NaN or
+        infinity.
+        """
         line = format_record(record)
         self._file.append(line)
         self.content += line
         self.records.append(record)
 
     def take_back(self) -> None:
-        """Remove the last appended record; raise InputError if that is impossible."""
+        """Remove the last appended record from file, `records` and `content`.
+
+        Raises InputError if that is impossible.
+        """
         previous_size = self.content.rfind(b'\n', 0, -1) + 1
         self._file.truncate(previous_size)
         del self.content[previous_size:]
@@ -134,14 +142,17 @@ def read_journal(path: Path) -> JournalText:
 
 
 def format_record(record: Record) -> bytes:
-    """Return a record as one line: JSON whose last member is the CRC-32 of the rest."""
+    """Return a record as one line with its end: JSON whose last member is the CRC-32 of the rest.
+
+    Raises ValueError for NaN or infinity. The record must not be empty.
+    """
     text = json.dumps(record, ensure_ascii=False, separators=(',', ':'), allow_nan=False)
     body = text[:-1].encode()
     return body + _seal(body) + b'\n'
 
 
 def parse_record(line: bytes) -> Record | None:
-    """Return the record of a line without its end; None if the line is incomplete."""
+    """Return the record of a line without its end; None if the line is incomplete or damaged."""
     body, seal = line[:-_SEAL_LENGTH], line[-_SEAL_LENGTH:]
     if _seal(body) != seal:
         return None
@@ -153,7 +164,7 @@ def parse_record(line: bytes) -> Record | None:
 
 
 def _seal(body: bytes) -> bytes:
-    """Return the last member of a line: the CRC-32 of its body."""
+    """Return the last member of a line: the CRC-32 of its body, in hexadecimal."""
     return b',"crc32":"%08x"}' % zlib.crc32(body)
 
 

@@ -28,12 +28,15 @@ def plain(values: Any) -> Any:
 
 
 def checked(content: Mapping[str, Any] | msgspec.Struct, record: type[Record]) -> Record:
-    """Content as a record: arrays as lists, NaN as None, unknown keys dropped."""
+    """Content as a record of a type: arrays as lists, NaN as None, unknown keys dropped.
+
+    Raises msgspec.ValidationError if a key is missing or has another type.
+    """
     return msgspec.json.decode(msgspec.json.encode(content, enc_hook=plain), type=record)
 
 
 def encoded(content: msgspec.Struct) -> bytes:
-    """Bytes of a file, indented."""
+    """Bytes of a record as JSON, indented by two blanks, with a line end."""
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b'\n'
 
 
@@ -55,10 +58,10 @@ def format_of(data: bytes) -> str | None:
 
 
 def decoded(data: bytes, path: Path, record: type[Record], form: str, remedy: str) -> Record:
-    """Record in the bytes of a file; unknown keys are dropped.
+    """Record of a type in the bytes of a JSON file; unknown keys are dropped.
 
-    Raises InputError, a line with `path`, the key and the `remedy`, if it is damaged, lacks a key,
-    or has another format than `form`.
+    ``form``: value of the key ``format`` that the file must have. Raises InputError, a line with
+    ``path``, the key and the ``remedy``, if it is damaged, lacks a key, or has another format.
     """
     # First: another file's keys would only confuse.
     given = format_of(data)

@@ -26,9 +26,9 @@ _LINE = re.compile(r'([0-9a-f]{64}) [ *]([^\0]+)')
 
 
 def read_manifest(folder: Path) -> dict[str, str]:
-    """Return the checksum of each closed file by name; {} if there is no manifest.
+    """Return the SHA-256 (hexadecimal) of each closed file by name; {} if there is no manifest.
 
-    Raises InputError if the manifest is damaged.
+    A last line without its end is not counted. Raises InputError if the manifest is damaged.
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -46,18 +46,28 @@ def read_manifest(folder: Path) -> dict[str, str]:
 
 
 def write_sums(folder: Path, sums: Mapping[str, str]) -> None:
-    """Write a manifest with these checksums by file name."""
+    """Write a manifest with these checksums by file name, sorted; the old one is replaced.
+
+    Raises DiskError if that fails.
+    """
     lines = [f'{checksum}  {name}\n' for name, checksum in sorted(sums.items())]
     write_atomically(folder / MANIFEST, ''.join(lines))
 
 
 def add_to_manifest(folder: Path, name: str) -> None:
-    """Add the checksum of one more closed file to the manifest."""
+    """Add the checksum of one more closed file to the manifest.
+
+    Raises InputError if the file or the manifest cannot be read, DiskError if it cannot be
+    written.
+    """
     write_sums(folder, {**read_manifest(folder), name: sha256_of(folder / name)})
 
 
 def remove_manifest(folder: Path) -> None:
-    """Remove the manifest durably, before its files are changed."""
+    """Remove the manifest durably, if there is one, before its files are changed.
+
+    Raises DiskError if that fails.
+    """
     path = folder / MANIFEST
     with writing(path):
         if path.exists():
@@ -66,12 +76,18 @@ def remove_manifest(folder: Path) -> None:
 
 
 def check_data(sums: Mapping[str, str], path: Path, data: bytes) -> None:
-    """Raise InputError if the content of a listed file is not that which was closed."""
+    """Raise InputError if the content of a listed file is not that which was closed.
+
+    A file that the checksums do not list is accepted.
+    """
     _compare(sums, path, hashlib.sha256(data).hexdigest())
 
 
 def check_file(sums: Mapping[str, str], path: Path) -> None:
-    """Check a file that is too large to read at once; see `check_data`."""
+    """Raise InputError if a listed file has another checksum than when it was closed.
+
+    For files too large to read at once. A file that the checksums do not list is not read.
+    """
     if path.name in sums:
         _compare(sums, path, sha256_of(path))
 
@@ -89,7 +105,7 @@ def sha256_of(path: Path) -> str:
 
 
 def _compare(sums: Mapping[str, str], path: Path, found: str) -> None:
-    """Raise InputError if a listed file has another checksum."""
+    """Raise InputError if a file is listed with another checksum than ``found``."""
     if sums.get(path.name, found) != found:
         raise InputError(
             f'{path}: not as it was closed, by its checksum in {MANIFEST}; take another copy '

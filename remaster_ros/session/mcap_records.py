@@ -35,8 +35,10 @@ def without_zeros(file: IO[bytes], size: int) -> int:
 def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[tuple[int, bytes]]:
     """Yield opcode and content of every record up to the end of the data section.
 
-    A record that ends among zeros, followed by more zeros, was not written completely, and raises
-    CutOffError.
+    ``size``: bytes of the file; ``crc``: CRC-32 of the bytes before, None within a chunk, which
+    ends without a data section's end; ``solid``: bytes without trailing zeros. Raises CutOffError
+    for a record that extends beyond the end or ends among trailing zeros; ValueError if the
+    checksum of the data section does not match.
     """
     while True:
         head = file.read(9)
@@ -62,7 +64,7 @@ def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[
 
 
 def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
-    """Yield records with chunks, which other recorders write, unpacked.
+    """Yield records (opcode, content) with chunks, which other recorders write, unpacked.
 
     Raises ValueError for a damaged chunk.
     """
@@ -79,9 +81,11 @@ def unchunked(records: Iterator[tuple[int, bytes]]) -> Iterator[tuple[int, bytes
 
 
 def _unpacked(chunk: Chunk) -> bytes:
-    """Return the content of a chunk; raise an error if it exceeds its stated size.
+    """Return the content of a chunk, packed by zstd, lz4 or not at all.
 
-    A few packed megabytes of zeros are gigabytes: they are refused before they fill the memory.
+    Raises ValueError if it is packed otherwise, states over 256 MiB (`CHUNK_LIMIT`), has another
+    size than stated or another checksum. A few packed megabytes of zeros are gigabytes: they are
+    refused before they fill the memory.
     """
     stated = chunk.uncompressed_size
     if stated > CHUNK_LIMIT:

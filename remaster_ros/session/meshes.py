@@ -56,7 +56,10 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
 
 
 def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
-    """Return the file of a mesh; raise InputError if there is none. Arguments as above."""
+    """Return the file of a mesh by its name in a URDF; arguments as of `mesh_reader`.
+
+    Raises InputError if there is none, or only outside of the folders that may be read.
+    """
     folders: list[Path] = [*mesh_path]
     files = Confinement(urdf, mesh_path)
     candidates: list[Path] = []
@@ -94,7 +97,8 @@ def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
 def read_mesh(path: Path) -> FloatArray:
     """Return the vertices of a mesh file (STL, OBJ, DAE or PLY), m, (n, 3).
 
-    Raises InputError if the file cannot be read.
+    Lengths are in m, in DAE in the file's own unit. Raises InputError if the file is missing, over
+    64 MiB or damaged, or has fewer than 4 vertices or one that is not finite.
     """
     vertices = _loaded(path, _vertices, skip_materials=True)
     if len(vertices) < 4 or not np.all(np.isfinite(vertices)):
@@ -113,9 +117,10 @@ class MeshPart:
 
 
 def read_mesh_parts(path: Path) -> list[MeshPart]:
-    """Return the surfaces of a mesh file, one part for each colour.
+    """Return the surfaces of a mesh file, one part for each colour, None included.
 
-    Raises InputError if the file cannot be read, or has no triangle.
+    Parts with a vertex that is not finite are left out. Raises InputError if the file cannot be
+    read, or no triangle is left.
     """
     parts = _loaded(path, _parts, skip_materials=False)
     if not parts:
@@ -124,14 +129,14 @@ def read_mesh_parts(path: Path) -> list[MeshPart]:
 
 
 def _vertices(loaded: list[Any], unit: float) -> FloatArray:
-    """Return the vertices of parts, m, (n, 3)."""
+    """Return the vertices of trimesh parts, times ``unit``, m, (n, 3)."""
     points = [point for part in loaded for point in getattr(part, 'vertices', ())]
     vertices: FloatArray = np.array(points, dtype=float).reshape(-1, 3) * unit
     return vertices
 
 
 def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
-    """Return the surfaces of parts by colour."""
+    """Return the surfaces of trimesh parts by colour; ``unit``: length of their unit, m."""
     by_color: dict[tuple[float, float, float] | None, list[Any]] = {}
     for part in loaded:
         if len(getattr(part, 'faces', ())) and np.all(np.isfinite(part.vertices)):
@@ -146,7 +151,7 @@ def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
 
 
 def _color(part: Any) -> tuple[float, float, float] | None:
-    """Return the colour of a part in trimesh; None if it has none."""
+    """Return the colour of a trimesh part, red, green, blue from 0 to 1; None without one."""
     visual = part.visual
     main = getattr(getattr(visual, 'material', None), 'main_color', None)
     if main is None and visual.defined:
@@ -162,7 +167,8 @@ def _loaded(
 ) -> Taken:
     """Return the result of ``take`` on the parts of a mesh file and the length of its unit, m.
 
-    Raises InputError if the file cannot be read. ``skip_materials``: do not read textures.
+    ``skip_materials``: do not read textures. Raises InputError if the format is not in `KINDS`,
+    the file is missing, over 64 MiB or damaged, or ``take`` fails.
     """
     kind = path.suffix.lower()
     if kind not in KINDS:

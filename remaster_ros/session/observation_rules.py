@@ -59,7 +59,10 @@ class SequenceRules:
         return rules
 
     def problem(self, row: RowKeys) -> str:
-        """Return what is wrong with the next row ("column …: …; remedy"); '' if valid."""
+        """Return what is wrong with the next row ("column …: …; remedy"); '' if valid.
+
+        The row is not added: see `accept`.
+        """
         same = self._of_observation.get(row.observation)
         if same is not None:
             return (
@@ -104,7 +107,7 @@ class SequenceRules:
         return ''
 
     def accept(self, row: RowKeys) -> None:
-        """Add a valid row."""
+        """Add a valid row; it is not checked again."""
         self._last = row
         self._of_observation[row.observation] = row
         self._of_pose.setdefault(row.pose, row)
@@ -115,7 +118,7 @@ class SequenceRules:
 
 
 def split_indices(m: Measurements) -> IntArray:
-    """Return the index into `SPLITS` of every row, (n,)."""
+    """Return each row's index into `SPLITS`: 0 optimization, 1 validation, 2 reference, (n,)."""
     index = m.is_validation.astype(np.int64)
     if m.is_reference is not None:
         index[m.is_reference] = SPLITS.index('reference')
@@ -123,7 +126,7 @@ def split_indices(m: Measurements) -> IntArray:
 
 
 def row_keys(m: Measurements, first_line: int) -> Iterator[RowKeys]:
-    """Return an iterator of the keys of every row; the first row is on `first_line`."""
+    """Return an iterator of the keys of every row; the first row is on line ``first_line``."""
     lines = range(first_line, first_line + len(m))
     frame = np.full(len(m), -1) if m.frame is None else m.frame
     columns = (

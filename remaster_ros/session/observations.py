@@ -78,14 +78,20 @@ class Table:
         self.cells = {name: cells[i::width] for i, name in enumerate(names)}
 
     def fault(self, row: int, column: str, problem: str) -> InputError:
-        """Return the error for one cell."""
+        """Return the InputError for one cell: file, line, column, the cell's text and the problem.
+
+        ``row``: from 0, without the header; ``problem``: end of the sentence.
+        """
         cell = self.cells[column][row]
         shown = repr(cell if len(cell) <= 40 else cell[:40] + '…')
         line = self.first_line + row
         return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
 
     def refuse(self, wrong: BoolArray, problems: Mapping[str, str]) -> None:
-        """Raise the error of the first True of `wrong`, (n, columns); `problems`: by column."""
+        """Raise the InputError of the first True of ``wrong``, (n, columns), if there is one.
+
+        ``problems``: end of the sentence by column, in the order of the columns.
+        """
         for row, column in np.argwhere(wrong)[:1]:
             name = list(problems)[column]
             raise self.fault(int(row), name, problems[name])
@@ -133,7 +139,11 @@ class Table:
         return result
 
     def whole_or_empty(self, columns: Sequence[str]) -> FloatArray:
-        """Return optional columns, of which each row fills all or none, (n, len(columns))."""
+        """Return optional columns, of which each row fills all or none (NaN), (n, len(columns)).
+
+        Raises InputError at the first row that fills some, or the first cell that is no finite
+        number.
+        """
         values = self.numbers(columns, optional=True)
         unknown = np.isnan(values)
         problem = (
@@ -154,7 +164,10 @@ class Table:
         return values
 
     def _not_a_number(self, column: str, optional: bool) -> InputError:
-        """Return the error of the first cell that is not a number."""
+        """Return the InputError of the first cell of a column that is not a finite number.
+
+        With ``optional`` an empty cell is valid. There has to be such a cell.
+        """
         row = next(
             row
             for row, cell in enumerate(self.cells[column])
@@ -166,7 +179,10 @@ class Table:
 
 
 def split_line(line: str, path: Path, number: int) -> list[str]:
-    """Return the cells of one line; raise InputError if quotes are not closed."""
+    """Return the cells of one line; ``number``: of the line, for the message.
+
+    Raises InputError if quotes are not closed.
+    """
     if '"' not in line:
         return line.split(',')
     try:
@@ -178,7 +194,7 @@ def split_line(line: str, path: Path, number: int) -> list[str]:
 def column_names(
     joints: int, slides: Sequence[bool] | BoolArray | None = None, moving: bool = False
 ) -> dict[str, list[str]]:
-    """Return the columns of each field of `Observation`, in the order written.
+    """Return the columns of each field of `Observation`, as written; joints count from 1.
 
     ``slides``: whether each joint is prismatic, (k,): its positions are in m, its efforts in N;
     ``moving``: with the `MOVING` fields.
@@ -247,7 +263,10 @@ class RowFormat:
         return ','.join(self._written) + '\n'
 
     def line(self, o: Observation) -> str:
-        """Return an observation as a line without its end; numbers are exact."""
+        """Return an observation as a line without its end; numbers are exact, unknown ones empty.
+
+        Optional fields that the format does not write are dropped.
+        """
         joints = len(o.q)
         cells: dict[str, list[str]] = {
             'observation': [str(int(o.observation))],
@@ -276,7 +295,7 @@ class RowFormat:
         return ','.join(cell for of_field in cells.values() for cell in of_field)
 
     def text(self, m: Measurements) -> str:
-        """Return all observations as the text of the file."""
+        """Return all observations as the text of the file with its header, unchecked."""
         rows = observations_of(m, self._sensors, self._markers)
         return self.header + ''.join(f'{self.line(row)}\n' for row in rows)
 
@@ -312,10 +331,10 @@ class RowFormat:
         return measurements
 
     def check(self, rows: Sequence[str], first_line: int, rules: SequenceRules) -> list[RowKeys]:
-        """Check lines to be written as a reader would; return their keys.
+        """Check lines to be written as a reader would; return their keys, [] for no lines.
 
-        ``first_line``: line number of the first one; ``rules``: accept the rows. Errors as
-        `parse`.
+        ``first_line``: line number of the first one; ``rules``: the rows are added to them. Raises
+        InputError, naming file, line and column, at the first invalid one.
         """
         if not rows:
             return []
@@ -335,7 +354,12 @@ class RowFormat:
         return keys
 
     def _convert(self, table: Table) -> Measurements:
-        """Return the columns, each checked by itself."""
+        """Return the columns of a table, each checked by itself.
+
+        Raises InputError for text that is no number or unknown name, a quaternion off length 1 by
+        over 0.001, a negative std, joints outside the limits (if these are checked), or a far
+        point.
+        """
         columns, chain = self._columns, self._chain
 
         def given(field: str) -> bool:
@@ -408,7 +432,7 @@ class RowFormat:
 
 
 def _refuse_other_separators(header: str, path: Path) -> None:
-    """Raise InputError if a header has another separator than the comma."""
+    """Raise InputError if a header has more semicolons, or more tabs, than commas."""
     for separator, name in ((';', 'semicolons'), ('\t', 'tabs')):
         if header.count(separator) > header.count(','):
             raise InputError(
@@ -420,7 +444,7 @@ def _refuse_other_separators(header: str, path: Path) -> None:
 def _whole_lines(data: bytes, most: int) -> int:
     """Return the number of bytes at the beginning that are whole lines.
 
-    The rows of a configuration, `most` at most, are written together: zeros in earlier rows are
+    The rows of a configuration, ``most`` at most, are written together: zeros in earlier rows are
     not the effect of a crash, and are left for the reader to refuse.
     """
     end = data.rfind(b'\n') + 1
@@ -461,7 +485,7 @@ def observations_of(
 
 
 def optional_of(m: Measurements) -> list[str]:
-    """Return the `OPTIONAL` fields that columns have."""
+    """Return the `OPTIONAL` fields that are not None in measurements, in that order."""
     return [name for name in OPTIONAL if getattr(m, name) is not None]
 
 
@@ -485,13 +509,16 @@ def stacked(parts: Sequence[Measurements]) -> Measurements:
 
 
 def _unknown(like: NDArray[Any], count: int) -> NDArray[Any]:
-    """Return a column of unknown values: NaN, -1 or False, (count, ...)."""
+    """Return a column of unknown values, (count, ...): NaN, -1 or False, by its type."""
     fill = {'f': np.nan, 'i': -1, 'b': False}[like.dtype.kind]
     return np.full((count, *like.shape[1:]), fill, dtype=like.dtype)
 
 
 def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path) -> None:
-    """Raise InputError if a header lacks columns of the format."""
+    """Raise InputError for a missing or repeated column, or one in a wrong unit.
+
+    ``names``: of the header; ``columns``: of `column_names`. Unknown columns are only logged.
+    """
     where = f'{path}, line 1'
     for name in names:
         if names.count(name) > 1:
@@ -540,10 +567,11 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
 
 
 def inverted_readings(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
-    """Return rows in which readings of sensors on the tool are inverted.
+    """Return rows in which readings of sensors on the tool (indices) are inverted.
 
     Poses of a fixed body in the sensor's frame become poses of the sensor in the body's frame, and
-    back. Raises InputError, which begins with `where`, if one has no orientation.
+    back. The same rows if there are none of these sensors. Raises InputError, which begins with
+    ``where``, if one has no orientation.
     """
     mine = np.flatnonzero(np.isin(m.sensor, sensors))
     if len(mine) == 0:
@@ -561,12 +589,12 @@ def inverted_readings(m: Measurements, sensors: Sequence[int], where: str) -> Me
 
 
 def _not_among(key: str, names: Sequence[str]) -> str:
-    """Return the message for an unknown name."""
+    """Return the end of the message for a name that session.yaml does not have under ``key``."""
     return f'is not among the {key} of session.yaml ({", ".join(names)}); correct either'
 
 
 def _numbers(values: FloatArray | Sequence[float] | None, count: int) -> list[str]:
-    """Return numbers as cells, empty if unknown."""
+    """Return numbers as ``count`` cells, exact; empty for NaN, all of them for None."""
     if values is None:
         return [''] * count
     numbers = np.asarray(values, float).tolist()

@@ -36,13 +36,16 @@ def find_package(name: str, file: Path, package_path: Sequence[Path] = ()) -> Pa
 
 
 def sourced() -> list[Path]:
-    """Return the share folders of the sourced workspaces."""
+    """Return the share folders of the sourced workspaces, by AMENT_PREFIX_PATH; [] without it."""
     prefixes = os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep)
     return [Path(prefix) / 'share' for prefix in prefixes if prefix]
 
 
 def package_of(path: Path) -> Path | None:
-    """Return the folder of the ROS package that contains a file; None if there is none."""
+    """Return the folder of the ROS package that contains a file; None if there is none.
+
+    The nearest folder above it that has a package.xml.
+    """
     return next((folder for folder in path.parents if (folder / 'package.xml').is_file()), None)
 
 
@@ -72,7 +75,7 @@ class Confinement:
         self._folders.append(folder.resolve())
 
     def holds(self, path: Path) -> bool:
-        """Return whether a file may be read."""
+        """Return whether a file may be read: below one of the folders, or named by the user."""
         real, written = path.resolve(), Path(os.path.abspath(path))
         return (
             real in self._named
@@ -82,7 +85,11 @@ class Confinement:
 
 
 def _candidates(file: Path, package_path: Sequence[Path]) -> Iterator[Path]:
-    """Yield the folders in which, or as which, a package is searched."""
+    """Yield the folders in which, or as which, a package is searched.
+
+    Those given, the sourced share folders, then those above the file up to one named src or share,
+    or to the one below the root.
+    """
     yield from package_path
     yield from sourced()
     for folder in file.resolve().parents:
@@ -93,7 +100,10 @@ def _candidates(file: Path, package_path: Sequence[Path]) -> Iterator[Path]:
 
 
 def _inside(folder: Path) -> list[Path]:
-    """Return the ROS packages among the subfolders of a folder."""
+    """Return the ROS packages (with a package.xml) among the subfolders of a folder, sorted.
+
+    [] if it cannot be read.
+    """
     try:
         return sorted(path for path in folder.iterdir() if (path / 'package.xml').is_file())
     except OSError:
@@ -101,7 +111,7 @@ def _inside(folder: Path) -> list[Path]:
 
 
 def _declared_name(path: Path) -> str:
-    """Return the name in the package.xml of a folder; '' if there is none."""
+    """Return the package name in a package.xml; '' if there is none or it is unreadable."""
     try:
         if not path.is_file():
             return ''

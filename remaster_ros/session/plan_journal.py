@@ -56,7 +56,7 @@ class TourRecord(msgspec.Struct, tag_field='kind', tag='tour'):
     begin_at: int
 
     def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
-        """Return the tour of this arm at its beginning; ``model``: obstacles."""
+        """Return the tour of this arm at its beginning, no pose visited; ``model``: obstacles."""
         return Tour(
             chain,
             self.plans,
@@ -255,7 +255,7 @@ class PlanJournal:
     def _open(self) -> Journal:
         """Open the file, and restore the state from its records; begin a plan in an empty file.
 
-        Raises InputError if the file is damaged, or of other settings.
+        Raises InputError if another planner uses it, or it is damaged, or of other settings.
         """
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
@@ -309,7 +309,10 @@ class PlanJournal:
                 self.state, self.run = record.state, record.run
 
     def _note(self, record: PlanRecord) -> None:
-        """Write a record, and update the state by it."""
+        """Write a record, or keep it until the disk has room, and update the state by it.
+
+        The first one makes folder and file.
+        """
         if self._journal is None:
             make_folder(self.path.parent)
             self._journal = self._open()
@@ -318,7 +321,7 @@ class PlanJournal:
         self._follow(record)
 
     def write_out(self) -> None:
-        """Write the records that the disk has not taken yet; sets `trouble`."""
+        """Write the records that the disk has not taken yet; `trouble` is '' if all are."""
         try:
             while self._unwritten and self._journal is not None:
                 self._journal.append(self._unwritten[0])
@@ -328,7 +331,7 @@ class PlanJournal:
             self.trouble = str(error)
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
-        """Begin a tour; ``expected``: expected precision of its fit."""
+        """Begin a tour and note the state; ``expected``: expected precision of its fit."""
         how = tour.in_order, tour.one_solution, tour.reference_every, tour.order, tour.begin_at
         self._note(TourRecord(tour.plans, *how))
         if expected is not None:
@@ -337,12 +340,15 @@ class PlanJournal:
         self._note(StateRecord(self.state, self.run))
 
     def request_reference_round(self) -> None:
-        """Request a round of the references, since a person has changed the setup."""
+        """Request a round of the references, since a person has changed the setup.
+
+        Nothing happens without a tour or references.
+        """
         if self.tour is not None and self.tour.references:
             self._note(RoundRecord())
 
     def drop_remaining_fits(self) -> None:
-        """Drop the remaining poses to fit, since the precision goal is reached."""
+        """Drop the remaining poses to fit, as the precision goal is reached."""
         if self.tour is not None:
             self._note(EnoughRecord())
 
@@ -351,12 +357,12 @@ class PlanJournal:
         self._note(VisitRecord(visit.split, visit.index, visit.ids, visit.unreached))
 
     def record_state(self, state: str, run: str = '') -> None:
-        """Record the planner's state and run, once there is a plan."""
+        """Set state and token of the run; record them if they changed and there is a plan."""
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
             self._note(StateRecord(state, run))
 
     def close(self) -> None:
-        """Release the file for other planners."""
+        """Release the file for other planners; a second call does nothing."""
         if self._journal is not None:
             self._journal.close()

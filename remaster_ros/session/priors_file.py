@@ -33,7 +33,11 @@ class _OffsetPrior(_Strict):
     std_mm: Annotated[float | None, Bounds(0.0, 1000.0, 'mm', above=True)] = None
 
     def known(self, where: str) -> tuple[float, float, bool]:
-        """Return mean and std, rad or m, and whether it is m; raise InputError without a unit."""
+        """Return mean and std, rad or m, and whether it is m.
+
+        ``where``: beginning of the message. Raises InputError unless mean and std are given in
+        exactly one of degrees and mm.
+        """
         degrees, lengths = (self.mean_deg, self.std_deg), (self.mean_mm, self.std_mm)
         in_m = degrees == (None, None)
         mean, std = lengths if in_m else degrees

@@ -81,7 +81,7 @@ def read_session(folder: str | os.PathLike[str], *, within_limits: bool = True) 
 
 
 def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
-    """Read a session with these checksums; errors as `read_session`."""
+    """Read a session with these checksums (by file name); raises InputError as `read_session`."""
     header_path = folder / HEADER
     data = read_limited(header_path, YAML_LIMIT, 'a session folder holds session.yaml')
     check_data(sums, header_path, data)
@@ -113,7 +113,7 @@ def _read(folder: Path, sums: dict[str, str], within_limits: bool) -> Session:
 
 
 def read_header(folder: Path) -> SessionHeader:
-    """Read session.yaml."""
+    """Read session.yaml of a folder; raise InputError if it is missing or invalid."""
     path = folder / HEADER
     return parse_header(read_limited(path, YAML_LIMIT, f'a session folder holds {HEADER}'), path)
 
@@ -121,7 +121,10 @@ def read_header(folder: Path) -> SessionHeader:
 def read_robot(
     folder: Path, header: SessionHeader, sums: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, SerialChain]:
-    """Read the URDF of a session, and check it against its checksum if that is listed."""
+    """Return the URDF text of a session and its chain; check its checksum if that is listed.
+
+    Raises InputError if the file is missing, changed, or has no such arm.
+    """
     path = folder / header.robot.urdf
     data = read_limited(path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')
     check_data(sums, path, data)
@@ -157,7 +160,7 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
 
 
 def all_rows(session: Session) -> Measurements:
-    """Return all rows of a session, references included, in the order measured."""
+    """Return all rows of a session, references included, sorted by observation number."""
     m, references = session.measurements, session.references
     if references is None:
         return m

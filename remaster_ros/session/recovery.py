@@ -64,7 +64,8 @@ def recover_session(folder: str | os.PathLike[str]) -> Recovery:
 def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> None:
     """Complete the session files from the journal and close the session; note repairs.
 
-    Exit status 'aborted' if the header has none.
+    The exit status is kept, 'aborted' if the header has none. Raises InputError as
+    `recover_session`.
     """
     urdf, chain = read_robot(folder, header)
     session = header.session(urdf, Measurements.empty(len(chain)))
@@ -79,7 +80,7 @@ def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> 
 
 
 def _note(recovery: Recovery, lost: str) -> None:
-    """Add a loss to the findings."""
+    """Add a loss, one line, to the findings and mark them as finished; nothing for ''."""
     if lost:
         recovery.finished = True
         recovery.lost.append(lost)

@@ -44,7 +44,7 @@ log = logging.getLogger('remaster_ros')
 
 
 def is_xacro(path: Path) -> bool:
-    """Return whether a description is xacro, by its name, never by its content."""
+    """Return whether a description is xacro: by the extension .xacro, never by its content."""
     return path.suffix == '.xacro'
 
 
@@ -122,7 +122,7 @@ def read_description(
 
 
 def _names_a_file(value: str) -> bool:
-    """Return whether the value of an argument is a file of a description, not a mere word."""
+    """Return whether an argument's value is an existing file with an extension of `_NAMED`."""
     path = Path(value)
     try:
         return path.suffix in _NAMED and path.is_file()
@@ -139,7 +139,7 @@ def _from_here(value: str) -> str:
 
 
 def _too_slow(path: Path, after: str) -> InputError:
-    """Return the error of an expansion that takes longer than `after`, a time as text."""
+    """Return the InputError of an expansion that is not done after a time, given as text."""
     return InputError(
         f'{path}: xacro: it is not expanded after {after}; does a macro call itself, or double '
         'what it is given?'
@@ -174,7 +174,10 @@ def read_arm(
 
 
 def _words(tables: Sequence[Path]) -> set[str]:
-    """Return the words at the beginning of text files, in which columns are named."""
+    """Return the words in the first 16 KiB of text files, where columns are named.
+
+    Paths that are no files are skipped.
+    """
     words: set[str] = set()
     for path in tables:
         if path.is_file():

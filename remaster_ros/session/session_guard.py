@@ -23,7 +23,10 @@ Signature = tuple[int, int, int, int]
 
 
 def signature(path: Path) -> Signature | None:
-    """Return the signature of a file, which changes when it does; None if it is missing."""
+    """Return the signature of a file, which changes when it does; None if it is missing.
+
+    Raises DiskError if it cannot be looked up.
+    """
     with writing(path):
         try:
             status = path.stat()
@@ -47,7 +50,7 @@ class SessionGuard:
         self._seen: dict[str, Signature | None] = {}
 
     def note(self, name: str) -> None:
-        """Remember the present state of a file, after the writer has changed it."""
+        """Remember the present state of a file (its name), after the writer has changed it."""
         self._seen[name] = signature(self._folder / name)
 
     def note_all(self) -> None:
@@ -76,9 +79,10 @@ class SessionGuard:
             os.close(descriptor)
 
     def differing(self, *, content: bool) -> dict[str, str]:
-        """Return the files that differ from the last known state, and how.
+        """Return how each file differs from its last known state, by name; {} if none does.
 
-        With `content` every byte is compared, else size and time of change.
+        'was removed', 'was replaced …' or 'was changed'. With ``content`` every byte is compared,
+        else only files whose size or time has changed.
         """
         wrong = {}
         for name in self._names:
@@ -97,7 +101,10 @@ class SessionGuard:
 
 
 def rename_changed(path: Path) -> str:
-    """Rename a foreign file to ``NAME.changed``; return its new name, '' if there is none."""
+    """Rename a foreign file to ``NAME.changed`` (``.changed2``, … if taken); return its new name.
+
+    '' if there is no file. Raises DiskError if it cannot be renamed.
+    """
     number, new_path = 1, path.with_name(f'{path.name}.changed')
     while os.path.lexists(new_path):
         number += 1

@@ -41,7 +41,10 @@ class Outcomes:
         self.poses: dict[int, tuple[str, dict[int, str]]] = {}
 
     def take(self, record: Record) -> None:
-        """Add the next record; the last one of a configuration counts."""
+        """Add the next record of the journal; the last one of a configuration counts.
+
+        A new plan drops all outcomes; records of registrations by hand do not count.
+        """
         if record['kind'] == 'plan':
             self.plan, self.poses = record['id'], {}
         elif record['kind'] == 'configuration' and record['pose'] != BY_HAND.pose:
@@ -49,11 +52,14 @@ class Outcomes:
             self.poses[record['pose']] = split, {**ends, record['solution']: record['result']}
 
     def of(self, pose: int, solution: int) -> str:
-        """Return the outcome of a configuration; '' if it has none yet."""
+        """Return a configuration's outcome, such as 'recorded'; '' if it has none yet.
+
+        ``pose``, ``solution``: the planner's numbers.
+        """
         return self.poses.get(pose, ('', {}))[1].get(solution, '')
 
     def decided(self) -> Decided:
-        """Return the outcomes in the form of the message to the planner."""
+        """Return the outcomes in the form of the message to the planner: last pose and counts."""
         last = next(reversed(self.poses), None)
         solutions = () if last is None else tuple(self.poses[last][1])
         ends = [
@@ -65,7 +71,10 @@ class Outcomes:
 
 
 def read_outcomes(folder: Path) -> Outcomes:
-    """Return the outcomes in a session; none if it has no journal."""
+    """Return the outcomes in a session folder; empty if it has no journal.
+
+    Raises InputError if the journal is damaged.
+    """
     outcomes = Outcomes()
     if (folder / JOURNAL).exists():
         for record in read_journal(folder / JOURNAL).records:
@@ -108,7 +117,11 @@ class SessionJournal:
         self.reopen()
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Continue a stopped session; with `go_further`, a complete one."""
+        """Continue a stopped session; with ``go_further``, a complete one.
+
+        The state is restored from the journal. A complete session is otherwise left closed, with a
+        note. Raises InputError as the class.
+        """
         if is_complete(self.folder) and not go_further:
             rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
             self.observations = rows.count(b'\n') - 1
@@ -128,7 +141,7 @@ class SessionJournal:
             self._replay(record)
 
     def _replay(self, record: Record) -> None:
-        """Restore the state by a record."""
+        """Restore registrations, references, outcomes and clock shift by a record."""
         kind = record['kind']
         self.outcomes.take(record)
         if kind == 'configuration':
@@ -145,7 +158,10 @@ class SessionJournal:
             self._shift_s = record['shift_s']
 
     def _append(self, record: Record, observations: Sequence[Observation] = ()) -> None:
-        """Write a record and its observations, and update the state."""
+        """Write a record and its observations durably, and update the outcomes.
+
+        Raises as `SessionWriter.record`.
+        """
         assert self._writer is not None
         self._writer.record(record, observations)
         self.outcomes.take(record)
@@ -156,7 +172,11 @@ class SessionJournal:
         return self.outcomes.plan
 
     def follow(self, plan_id: str) -> bool:
-        """Bind the session to a plan; return False if it belongs to another one."""
+        """Bind the session to a plan; return False if it belongs to another one.
+
+        A session without observations, or without a plan, takes the new one, which is written to
+        the journal.
+        """
         if plan_id == self.plan_id:
             return True
         if self.observations and self.plan_id:
@@ -165,7 +185,10 @@ class SessionJournal:
         return True
 
     def result(self, pose: int, solution: int) -> Outcome | None:
-        """Return the outcome of a configuration; None if it is not recorded yet."""
+        """Return a configuration's outcome 'recorded' or 'partial'; None if it has neither yet.
+
+        ``pose``, ``solution``: the planner's numbers.
+        """
         result = self.outcomes.of(pose, solution)
         return next((final for final in _FINAL if final == result), None)
 
@@ -175,7 +198,10 @@ class SessionJournal:
         return None if self._writer is None else self._writer.correction
 
     def take_correction(self, correction: Correction) -> None:
-        """Store, before the first row, that a correction is on; DiskError as `write`."""
+        """Store, before the first row, that a correction is on.
+
+        Raises InputError if rows were written without one, DiskError if the disk is full.
+        """
         assert self._writer is not None
         self._writer.correct(correction)
 
@@ -247,7 +273,11 @@ class SessionJournal:
         temperatures_c: Sequence[float | None],
         change: FloatArray | None,
     ) -> list[Observation]:
-        """Return the observations of readings, sorted by time."""
+        """Return the observations of readings, sorted by time; [] without readings.
+
+        Arguments as of `write`. If the clock ran backwards, a shift is written to the journal
+        first.
+        """
         writer = self._writer
         if not readings or writer is None:
             return []
@@ -277,14 +307,17 @@ class SessionJournal:
         ]
 
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
-        """Return the columns of a reading, without the number of dropped frames."""
+        """Return a reading's fields for an observation: stamp shifted, on the tool inverted."""
         if reading.sensor in self._header.on_tool:
             reading = reading.inverted()
         values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))
         return {name: value for name, value in values.items() if name != 'dropped'}
 
     def _keep_time(self, stamp_s: float) -> None:
-        """Shift stamps if the clock ran backwards, so that time in a session never does."""
+        """Set and record a shift of stamps if the clock ran backwards: session time never does.
+
+        ``stamp_s``: the first of the next rows, which then is 1 s (`SHIFT_S`) after the last one.
+        """
         assert self._writer is not None
         last_s = self._writer.last_stamp_s
         if last_s is None or stamp_s + self._shift_s >= last_s:
@@ -295,12 +328,15 @@ class SessionJournal:
         self.notes.append(f'the clock ran backwards: stamps are shifted by {self._shift_s:.3f} s')
 
     def check(self) -> None:
-        """Repair files that others changed; raise DiskError if that is impossible (yet)."""
+        """Repair files that others changed, unless the session is closed.
+
+        Raises MovedError or DiskError as `SessionWriter.check`.
+        """
         if not self.closed and self._writer is not None:
             self._writer.check()
 
     def take_restored(self) -> list[str]:
-        """Return the repairs since the last call, one line each."""
+        """Return the repairs since the last call, one line each, and forget them."""
         if self._writer is None:
             return []
         lines, self._writer.restored = self._writer.restored, []
@@ -321,7 +357,10 @@ class SessionJournal:
 
 
 def is_complete(folder: Path) -> bool:
-    """Whether a folder has a complete session; raise InputError for a damaged one."""
+    """Whether a folder has a session with exit status 'complete'.
+
+    False without session.yaml; raises InputError for a damaged one.
+    """
     return (folder / HEADER).exists() and read_header(folder).exit_status == 'complete'
 
 
@@ -333,5 +372,5 @@ def _split(name: str) -> Split:
 
 
 def _plain(readings: Sequence[PairedReading]) -> list[dict[str, Any]]:
-    """Return readings as plain data without None."""
+    """Return readings as plain data, fields that are None left out."""
     return [{k: v for k, v in reading.items() if v is not None} for reading in to_plain(readings)]

@@ -108,7 +108,7 @@ class Parameters(SimulationParameters):
 
 
 def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
-    """Return how each sensor of the cell is read."""
+    """Return the rules by which each sensor of the cell is read, in the cell's order."""
     return tuple(
         SensorRules(
             sensor=name,
@@ -126,7 +126,7 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
 
 
 def session_header(cell: Workcell, settle_s: float) -> Session:
-    """Return a session of this cell without observations."""
+    """Return a session of this cell without observations, created now (UTC)."""
     chain = cell.chain()
     return Session(
         urdf=cell.urdf_text,
@@ -245,7 +245,10 @@ class SessionRecorder:
         return self.keeper.journal
 
     def _begin(self) -> None:
-        """Restore the state from the session, as a recorder does when it starts."""
+        """Restore the state from the session on the disk, as a recorder does when it starts.
+
+        Readings under way, registrations and changes are made anew.
+        """
         cell, p = self.cell, self._p
         markers = {name: np.array(position) for name, position in cell.markers.items()}
         self.recording = Recording(
@@ -276,7 +279,7 @@ class SessionRecorder:
         self.changes.take_back(self.journal.watched, self.registration.T_R_N)
 
     def _positions(self, message: Any) -> FloatArray | None:
-        """Return the positions of the cell's joints, rad, (k,); None if invalid (`trouble`)."""
+        """Return positions of the cell's joints, rad or m, (k,); None if invalid (`trouble`)."""
         try:
             return self._order.positions(message)
         except InputError as error:
@@ -284,14 +287,21 @@ class SessionRecorder:
             return None
 
     def take_joints(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of the robot; those of a gripper are ignored."""
+        """Take a sensor_msgs/JointState of the robot; those of a gripper are ignored.
+
+        An invalid one is dropped and sets `trouble`, a valid one clears it; a decided reading is
+        ended.
+        """
         if self._order.concerns(message) and (q := self._positions(message)) is not None:
             self.trouble = ''
             self.recording.take_joints(seconds(message.header.stamp), q)
             self.end_reading()
 
     def take_solutions(self, message: Any) -> None:
-        """Take a trajectory_msgs/JointTrajectory with the solutions of the announced pose."""
+        """Take a trajectory_msgs/JointTrajectory with the solutions of the announced pose.
+
+        An invalid one counts as one without solutions and sets `trouble`.
+        """
         try:
             solutions = solutions_of(message, self.chain.joint_names)
         except InputError as error:
@@ -300,7 +310,10 @@ class SessionRecorder:
         self.recording.take_solutions(stamp_key(message.header.stamp), solutions)
 
     def take_settled(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of a settled arm."""
+        """Take a sensor_msgs/JointState of a settled arm; the next reading begins if one is due.
+
+        At no solution of the announced pose it is counted as 'settled_unknown' and sets `trouble`.
+        """
         if (q := self._positions(message)) is None:
             return
         try:
@@ -348,7 +361,11 @@ class SessionRecorder:
             self.recording.take_temperature(seconds(message.header.stamp), message.temperature)
 
     def take_record(self, record: events.EventRecord) -> None:
-        """Update the state by an event record of another node, or of the recorder of a bag."""
+        """Update the state by an event record of another node, or of the recorder of a bag.
+
+        Poses, failed solutions, planner and bridge states and stops of the arm always; outcomes
+        and readings by hand only from a bag. Other records are ignored.
+        """
         match record.body:
             case events.PoseAnnounced() as pose:
                 self._on_pose(pose)
@@ -374,7 +391,11 @@ class SessionRecorder:
                 self.recording.begin_by_hand(read.stamp_s, np.array(read.q))
 
     def _on_began(self, began: events.RecorderBegan) -> None:
-        """Restart as the recorder of a bag did, with the state of its session at that time."""
+        """Restart as the recorder of a bag did, with the state of its session at that time.
+
+        The first start of a bag opens nothing; a later one closes the session as stopped and
+        reopens it. Nothing is done if the recorder only continued.
+        """
         first, self.from_bag = not self.from_bag, True
         if began.continued:
             return
@@ -384,7 +405,7 @@ class SessionRecorder:
         self._begin()
 
     def _end_as_recorded(self, result: str, reason: str) -> None:
-        """Decide the reading under way as the bag's recorder did."""
+        """Decide the reading under way as the bag's recorder did: its result and reason."""
         self.recording.end_as_recorded(result, reason)
         self.end_reading()
 
@@ -421,7 +442,10 @@ class SessionRecorder:
             self.keeper.write(self._go_further)
 
     def _go_further(self) -> None:
-        """Reopen the complete session for measurements that separate causes."""
+        """Reopen the complete session for measurements that separate causes.
+
+        An InputError sets `trouble`. The state is published.
+        """
         try:
             self.keeper.reopen(go_further=True)
         except InputError as error:
@@ -433,7 +457,10 @@ class SessionRecorder:
 
     @property
     def other_correction(self) -> str:
-        """Why the bridge's correction does not fit the rows of this session; ''."""
+        """Why the bridge's correction does not fit the rows of this session; '' if it does.
+
+        '' also without a correction in the bridge, or before the first row.
+        """
         noted, now = self.journal.correction, self.correction
         if not now or self.journal.closed or (noted is not None and noted.sha256 == now):
             return ''
@@ -447,14 +474,17 @@ class SessionRecorder:
         )
 
     def look(self) -> None:
-        """End a decided reading, begin the next, record unreachable solutions; called often."""
+        """End a decided reading, begin the next, record unreachable solutions; call often."""
         self.end_reading()
         self.recording.look_again()
         self.take_next()
         self._record_unreached()
 
     def _record_unreached(self) -> None:
-        """Record the plan of the announced pose, and its unreachable solutions."""
+        """Record the plan of the announced pose, and its solutions without a path or that failed.
+
+        Each once; nothing without an announced pose, if the session is closed or the disk full.
+        """
         pose = self.recording.announced
         if pose is None or self.journal.closed or self.keeper.full:
             return
@@ -479,7 +509,11 @@ class SessionRecorder:
                 self._outlet.state()
 
     def take_next(self) -> None:
-        """Begin the next reading, unless one is under way or being written."""
+        """Begin the next reading, unless one is under way or being written.
+
+        A configuration with an outcome is reported, not read again; one of another plan or
+        correction is skipped, with `trouble`.
+        """
         while not self.keeper.full and (settled := self.recording.next()) is not None:
             pose = settled.pose
             if self.journal.closed or not self.journal.follow(pose.plan):
@@ -498,7 +532,10 @@ class SessionRecorder:
             self._report(settled.recorded_before(known, registered=self.is_registered))
 
     def read_by_hand(self) -> None:
-        """Begin a reading at the arm's present position, for a registration by hand."""
+        """Begin a reading at the arm's present position, for a registration by hand.
+
+        A joint state has to have come before.
+        """
         q, now_s = self.recording.q, self.recording.now_s
         assert q is not None
         self._outlet.event(events.ReadByHand(stamp_s=now_s, q=tuple(q.tolist())))
@@ -511,7 +548,7 @@ class SessionRecorder:
         return self.required.are_among(self.registration.T_R_N)
 
     def end_reading(self) -> None:
-        """Write the outcome of the reading under way, once it is decided."""
+        """Count and write the outcome of the reading under way, once it is decided."""
         ended = self.recording.end(self.registration.T_R_N)
         if ended is None:
             return
@@ -562,7 +599,7 @@ class SessionRecorder:
         self.take_next()
 
     def _register(self, readings: Sequence[PairedReading]) -> None:
-        """Add readings of registration poses; publish completed registrations."""
+        """Add readings of registration poses; publish completed registrations, log troubles."""
         for name in self.registration.add(readings):
             self._outlet.registered(name, self.registration.T_R_N[name])
             self._outlet.log(logging.INFO, f'{name} is registered; {self.registration.describe()}')
@@ -570,14 +607,14 @@ class SessionRecorder:
             self._outlet.log(logging.WARNING, self.registration.troubles[name])
 
     def _report(self, end: events.ConfigurationEnded) -> None:
-        """Publish the outcome of a configuration."""
+        """Count and publish the outcome of a configuration, and the recorder's state."""
         self.counts[f'configurations_{end.result}'] += 1
         self._outlet.event(end)
         # The planner continues by the outcomes in the state.
         self._outlet.state()
 
     def _report_change(self, new: bool) -> None:
-        """Report a change at the references; the planner pauses if it is large."""
+        """Log and publish a change at the references if it is new; the planner pauses by it."""
         event = self.changes.report(self.run) if new else None
         if event is not None:
             self._outlet.log(logging.ERROR, event.text)
@@ -591,7 +628,7 @@ class SessionRecorder:
         self._outlet.state()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close the session; a second call does nothing."""
+        """Report changes of the setup and close the session; nothing if it is closed already."""
         if self.journal.closed:
             return
         self._report_change(self.changes.judge(self.registration.T_R_N))

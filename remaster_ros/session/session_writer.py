@@ -61,7 +61,11 @@ class ChangedError(InputError):
 
 
 def _begin(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write the files of a session without rows into a new folder, or one with only a plan."""
+    """Write the files of a session without rows into a new folder, or one with only a plan.
+
+    ``files``: content by name. Raises InputError if the folder has files, DiskError if it cannot
+    be written to.
+    """
     # The planner may have created the folder.
     if not (folder.is_dir() and os.listdir(folder) == [PLAN]):
         make_new_folder(folder)
@@ -92,8 +96,8 @@ def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: boo
     """Raise InputError if the folder has another session than the one to be recorded.
 
     ``files``: those of the session to be recorded, without rows. Refused are another robot, other
-    markers or sensors, a complete session, one without a journal, and one whose files changed
-    after it was closed.
+    markers or sensors, a complete session (unless ``even_complete``), one without a journal, and
+    one whose files changed after it was closed.
     """
     old, new = read_header(folder), parse_header(files[HEADER], folder / HEADER)
     if old.exit_status == 'complete' and not even_complete:
@@ -117,9 +121,9 @@ def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: boo
 
 
 def _reopen(folder: Path, *, keep_status: bool) -> str:
-    """Remove the marks of a closed session; return the text of its session.yaml.
+    """Remove temporary files and checksums of a closed session; return its session.yaml as text.
 
-    Its exit status becomes ``aborted``, unless `keep_status`.
+    Its exit status becomes ``aborted``, unless ``keep_status``.
     """
     path = folder / HEADER
     remove_leftovers(folder)
@@ -155,7 +159,7 @@ def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str
 
 
 def _read_rows(folder: Path) -> bytes:
-    """Return the content of observations.csv; raise InputError if it is missing."""
+    """Return the content of observations.csv; raise InputError if it cannot be read."""
     return read_limited(folder / ROWS, OBSERVATIONS_LIMIT, f'a session folder holds {ROWS}')
 
 
@@ -233,13 +237,16 @@ class SessionWriter:
             undo.pop_all()
 
     def _add_columns(self, *fields: str) -> None:
-        """Add optional columns to observations.csv, before its first row."""
+        """Add optional columns (of `OPTIONAL`) to the format of the rows, before the first row."""
         self._optional = (*self._optional, *fields)
         self._format = RowFormat(self._rows_path, self._chain, *self._names, self._optional)
         self._empty_rows = self._format.header.encode()
 
     def _complete_correction(self, plain_rows: bytes) -> None:
-        """Complete columns and key of a recorded correction after a crash."""
+        """Complete columns and key of a recorded correction after a crash; nothing without one.
+
+        ``plain_rows``: observations.csv without rows and without its columns.
+        """
         noted = [record for record in self.records if record['kind'] == 'correction']
         if not noted:
             return
@@ -250,7 +257,7 @@ class SessionWriter:
             write_atomically(self.folder / HEADER, self._text)
 
     def _use_correction(self, correction: Correction) -> None:
-        """Add columns and key of a correction."""
+        """Add columns and key of a correction in memory; the files are written by `_write_due`."""
         self.correction = correction
         self._add_columns('wanted', 'correction')
         self._text = with_correction(self._text, correction)
@@ -258,7 +265,8 @@ class SessionWriter:
     def correct(self, correction: Correction) -> None:
         """Record the correction that is on, before the first row: desired angles get columns.
 
-        After a DiskError call again when there is room.
+        A second call only completes the first. Raises InputError if there are rows already or the
+        writer is closed; DiskError if the disk is full: call again when there is room.
         """
         if self.correction is None:
             if self._closed or self.observations:
@@ -272,7 +280,7 @@ class SessionWriter:
         self._write_due()
 
     def _write_due(self) -> None:
-        """Write the files whose columns or keys have changed."""
+        """Write the files whose columns or keys have changed; DiskError if the disk is full."""
         while self._due:
             name = self._due[0]
             write_atomically(self.folder / name, self._content(name))
@@ -288,7 +296,7 @@ class SessionWriter:
         return self._journal.records
 
     def _content(self, name: str) -> bytes:
-        """Return the acknowledged content of a file of the session."""
+        """Return the acknowledged content of a file, by one of the names in `FILES`."""
         if name == ROWS:
             rows = (row for record in self.records for row in record.get('rows', ()))
             return self._empty_rows + ''.join(f'{row}\n' for row in rows).encode()
@@ -297,7 +305,11 @@ class SessionWriter:
         return self._text.encode() if name == HEADER else self._urdf
 
     def _complete_rows(self, even_changed: bool) -> None:
-        """Complete observations.csv from the journal, and find the next free numbers."""
+        """Complete observations.csv from the journal, and find the next free numbers.
+
+        Sets `lost`, `observations`, `configurations` and `last_stamp_s`. A file that was changed
+        is restored if ``even_changed``, else ChangedError is raised.
+        """
         # Incomplete line that was dropped after a crash; '' for none.
         self.lost = self._journal.lost
         wanted = self._content(ROWS)
@@ -325,7 +337,7 @@ class SessionWriter:
         self._accept(self._format.check(rows, self._line, self._rules.branch()))
 
     def append(self, observation: Observation) -> None:
-        """Write one observation durably, or not at all (see `record`)."""
+        """Write one observation durably, or not at all; raises as `record`."""
         self.record({'kind': 'observation'}, [observation])
 
     def record(self, record: Record, observations: Sequence[Observation] = ()) -> None:
@@ -385,7 +397,10 @@ class SessionWriter:
             self._guard.note(JOURNAL)
 
     def _restore(self, name: str) -> str:
-        """Write a file again; return the new name of the foreign file in its place."""
+        """Write a file of the session again from memory; return the new name of the foreign file.
+
+        '' if there was none.
+        """
         renamed = rename_changed(self.folder / name)
         if name == JOURNAL:
             self._journal.restore()
@@ -416,7 +431,7 @@ class SessionWriter:
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _accept(self, keys: Sequence[RowKeys]) -> None:
-        """Update numbers and rules by rows that are on the disk."""
+        """Update next free numbers, last stamp and rules by rows that are on the disk."""
         for key in keys:
             self._rules.accept(key)
             self._line = key.line + 1
@@ -450,7 +465,7 @@ class SessionWriter:
         return exit_status
 
     def release(self) -> None:
-        """Unlock the session, closed or not, for other processes."""
+        """Close and unlock the files, whatever the session's state; a second call does nothing."""
         self._closed = True
         self._rows.close()
         self._journal.close()

@@ -64,7 +64,10 @@ class BaseFrame(msgspec.Struct):
     std_rad: float
 
     def problem(self, key: str) -> str:
-        """Return what is wrong with the quaternion; '' if valid."""
+        """Return what is wrong with the quaternion (norm off 1 by over 0.001); '' if valid.
+
+        ``key``: path of this prior in the file, at the beginning of the message.
+        """
         norm = math.hypot(*self.rotation_xyzw)
         if abs(norm - 1.0) < 1e-3:
             return ''
@@ -112,7 +115,7 @@ class SessionHeader(msgspec.Struct):
     def session(
         self, urdf: str, measurements: Measurements, references: Measurements | None = None
     ) -> Session:
-        """Return the session with this header, robot and rows."""
+        """Return the session with this header, a URDF text, rows, and rows of references."""
         return Session(
             urdf=urdf,
             base_link=self.robot.base_link,
@@ -153,9 +156,10 @@ class SessionHeader(msgspec.Struct):
 
 
 def parse_header(data: bytes, path: Path) -> SessionHeader:
-    """Parse session.yaml; `path` is for messages.
+    """Parse session.yaml; unknown keys are kept in ``extra``, with a warning.
 
-    Raises InputError if the content is invalid.
+    ``path``: for messages. Raises InputError, naming the key, if the content is invalid or of
+    another format.
     """
     try:
         content = load_yaml(decode_text(data, path))
@@ -176,7 +180,11 @@ def parse_header(data: bytes, path: Path) -> SessionHeader:
 
 
 def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
-    """Return the text of session.yaml; raise InputError if the session breaks the format."""
+    """Return the text of session.yaml; keys without a value are left out.
+
+    ``urdf_name``: file inside the session folder; ``exit_status``: in place of the session's.
+    Raises InputError if the session breaks the format.
+    """
     content: dict[str, Any] = {
         'format': FORMAT_MOVING if session.is_moving else FORMAT,
         'robot': {
@@ -237,7 +245,10 @@ def with_correction(text: str, correction: Correction) -> str:
 
 
 def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
-    """Return the header in `content`; raise InputError, which begins with `where`."""
+    """Return the header in ``content``, checked; the key 'extra' is dropped.
+
+    Raises InputError, which begins with ``where``, for an invalid key, number or name.
+    """
     known = {key: value for key, value in content.items() if key != 'extra'}
     try:
         header = msgspec.convert(known, SessionHeader)
@@ -249,7 +260,10 @@ def _checked(content: Mapping[str, Any], where: str) -> SessionHeader:
 
 
 def _problem(header: SessionHeader) -> str:
-    """First error in names and times, with the remedy; '' if valid."""
+    """First error in names of files, markers, sensors and joints or in times, with the remedy.
+
+    '' if valid.
+    """
     urdf = PurePosixPath(header.robot.urdf)
     if urdf.is_absolute() or '..' in urdf.parts or not urdf.name or '\0' in header.robot.urdf:
         return (
@@ -304,7 +318,7 @@ def _problem(header: SessionHeader) -> str:
 
 
 def _controller_problem(controller: Controller) -> str:
-    """First error in the pad's joints; '' if valid."""
+    """First error in the pad's joints: names, zeros, couplings; '' if valid."""
     if not controller.joints:
         return 'controller.joints: none given; name the joints of the URDF, or leave it out'
     names = [joint.name for joint in controller.joints.values()]
@@ -341,7 +355,10 @@ def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path
 def _unknown_keys(
     content: Mapping[str, Any], known: Mapping[str, Any], path: Path, prefix: str = ''
 ) -> dict[str, Any]:
-    """Return the keys of nested dictionaries that `known` lacks, with a warning."""
+    """Return the keys of nested dictionaries that ``known`` lacks, with a warning for each.
+
+    ``prefix``: dotted path of the present dictionary, for the warning.
+    """
     extra = {}
     for key, value in content.items():
         if key not in known:
@@ -353,7 +370,7 @@ def _unknown_keys(
 
 
 def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Return content with unknown keys added at their places; known keys take precedence."""
+    """Return a copy of content with unknown keys added at their places; known ones remain."""
     merged = dict(content)
     for key, value in extra.items():
         if key not in merged:

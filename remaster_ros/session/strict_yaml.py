@@ -71,9 +71,10 @@ for _name, _pattern, _first in _CORE_RESOLVERS:
 
 
 def load_yaml(text: str) -> Any:
-    """Return the plain data of one YAML document.
+    """Return the plain data of one YAML document; None for an empty text.
 
-    Raises YamlError for several documents, an alias, a tag, a repeated key, or deep nesting.
+    Raises YamlError, one line with the place, for text that is not YAML, several documents, an
+    alias, a tag, a repeated key, or deep nesting.
     """
     try:
         return yaml.load(text, Loader=_Loader)

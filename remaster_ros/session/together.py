@@ -167,12 +167,15 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
 
 
 def _words(apart: OffsetDifferences) -> str:
-    """Return a difference of offsets as text."""
+    """Return the joints whose zero-offsets differ between two sessions, as a clause."""
     return f'fitted one by one their zero-offsets differ, {apart.words}'
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
-    """Raise InputError if sessions have different robots, or corrections in the controller."""
+    """Raise InputError if sessions have different robots, or corrections in the controller.
+
+    Different: URDF, base or tip link, or serial number, if both sessions have one.
+    """
     inside = [
         str(given.correction)
         if given.correction is not None and given.correction.is_inside
@@ -199,7 +202,7 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
 
 
 def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
-    """Return new, unused names of a session's sensors and markers."""
+    """Return new, unused names of sensors and markers: NAME_2 for session number 2."""
     taken = {*joined.sensors, *joined.markers}
     names = {}
     for name in dict.fromkeys((*session.sensors, *session.markers)):
@@ -212,7 +215,10 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
 
 
 def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> Measurements:
-    """Return rows with numbers added to columns, and to the frames present."""
+    """Return rows with a number added to each column of ``added``, and ``frames`` to frames.
+
+    Rows without a frame (-1) stay without one.
+    """
     columns = {name: getattr(part, name) + more for name, more in added.items()}
     if part.frame is not None:
         columns['frame'] = np.where(part.frame < 0, -1, part.frame + frames)
@@ -225,16 +231,16 @@ def _power_of_ten(largest: int) -> int:
 
 
 def _largest(session: Session, column: str) -> int:
-    """Return the largest value of a column."""
+    """Return the largest value of a column of all rows, references included; 0 without rows."""
     parts = [session.measurements, session.references]
     return max(int(getattr(part, column).max(initial=0)) for part in parts if part is not None)
 
 
 def _next_frame(rows: Measurements) -> int:
-    """Return the first unused frame number."""
+    """Return the first unused frame number; 0 without frames."""
     return 0 if rows.frame is None else int(rows.frame.max(initial=-1)) + 1
 
 
 def _last_stamp(session: Session) -> float:
-    """Return the latest stamp, s."""
+    """Return the latest stamp of the measurements, s; 0 without rows."""
     return float(session.measurements.stamp_s.max(initial=0.0))

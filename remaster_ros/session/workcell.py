@@ -107,7 +107,10 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     source: str = ''
 
     def publish_anew(self, name: str) -> None:
-        """Set the topic on which readings of a foreign node are published again."""
+        """Set `topic` to NAME/marker, on which readings of a foreign node are published again.
+
+        The node's topic becomes `source`. Nothing happens without a `message_type`.
+        """
         if self.message_type:
             self.source, self.topic = self.topic, f'{name}/marker'
 
@@ -124,7 +127,7 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
 
     @property
     def topics(self) -> dict[str, str]:
-        """Topic of the readings of each marker."""
+        """Topic of each marker's readings, by its name: TOPIC, and TOPIC/NAME for further ones."""
         of_further = {name: f'{self.topic}/{name}' for name in self.further_markers}
         return {self.marker: self.topic, **of_further}
 
@@ -159,7 +162,10 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return ''
 
     def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        """First validation error of the sensor's markers; '' if valid."""
+        """First validation error of the sensor's markers, prefixed by its YAML path; '' if valid.
+
+        Names, numbers in the body, and distances below `LEAST_APART_M`.
+        """
         names = ', '.join(markers)
         if self.marker not in markers:
             meant = did_you_mean(self.marker, markers)
@@ -205,7 +211,7 @@ class CellBox(msgspec.Struct, forbid_unknown_fields=True):
     yaw_deg: float = 0.0
 
     def body(self, name: str) -> Body:
-        """Return the body for collision checks."""
+        """Return the body for collision checks, in base_link; InputError for an invalid size."""
         rotation = matrix_from_rpy(np.array([0.0, 0.0, radians(self.yaw_deg)]))
         return obstacle(name, self.center_m, self.size_m, rotation)
 
@@ -223,7 +229,10 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
     length_m: float | None = None
 
     def shape(self) -> Shape:
-        """Return the shape about its centre; raise InputError unless it is one of these."""
+        """Return the shape about its centre: a box, a cylinder or a sphere.
+
+        Raises InputError unless the given sizes are those of exactly one of these, and valid.
+        """
         given = (self.size_m is not None, self.radius_m is not None, self.length_m is not None)
         if given == (True, False, False):
             return box(np.array(self.size_m))
@@ -236,7 +245,7 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def body(self, name: str, chain: SerialChain) -> Body:
-        """Return the body for collision checks, on the last joint of the arm."""
+        """Return the body for collision checks, on the last joint; InputError as `shape`."""
         turn = matrix_from_rpy(np.deg2rad(self.rpy_deg))
         T = chain.T_fixed[-1] @ transform(turn, np.array(self.center_m))
         return Body(name, len(chain), self.shape(), T, 'tool')
@@ -271,17 +280,20 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
     @property
     def sensor_kinds(self) -> dict[str, SensorKind]:
-        """Kinds of the sensors, where they are known."""
+        """Kind ('camera' or 'tracker') of each sensor whose kind is known, by its name."""
         kinds = {name: sensor.known_kind for name, sensor in self.sensors.items()}
         return {name: kind for name, kind in kinds.items() if kind}
 
     def chain(self) -> SerialChain:
-        """Return the arm's kinematic chain."""
+        """Return the arm's kinematic chain; raise InputError if the URDF has no such arm."""
         ends = self.robot.base_link, self.robot.tip_link
         return SerialChain.from_urdf(self.urdf_text, *ends)
 
     def fingerprint(self) -> str:
-        """Return a checksum of everything that a plan depends on."""
+        """Return a SHA-256 of everything that a plan depends on, in hexadecimal.
+
+        The path of the file, ``confirm`` and the kinds of sensors are left out.
+        """
         plain = msgspec.to_builtins(msgspec.structs.replace(self, file=''))
         del plain['confirm']
         for sensor in plain['sensors'].values():
@@ -308,7 +320,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return index and values (rad or m) of the held joint; None if there is none."""
+        """Return index (from 0) and values (rad or m) of the held joint; None if there is none."""
         if not self.held_joint:
             return None
         index = chain.joint_names.index(self.held_joint)
@@ -377,7 +389,11 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         *,
         without_meshes: bool = False,
     ) -> PlanningScene:
-        """Return the planning scene of this cell; arguments and errors as `collision_model`."""
+        """Return the planning scene of this cell, for poses and their joint solutions.
+
+        ``limit_margin_rad``: distance that solutions keep from joint limits; others, and
+        InputError, as of `collision_model`.
+        """
         sights = [
             LineOfSight(
                 name,
@@ -414,7 +430,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _no_mesh(name: str) -> None:
-    """Leave out any mesh."""
+    """Return None for any mesh, which leaves it out."""
 
 
 def config_path(name: str) -> Path:
@@ -436,7 +452,8 @@ def config_path(name: str) -> Path:
 def read_cell(path: str | Path) -> Workcell:
     """Read and check a cell file; a bare name such as ``demo`` is the shipped cells/demo.yaml.
 
-    An `InputError` names the file, the key and the remedy.
+    A path with an extension, or an existing file, is read itself. Raises InputError, which names
+    the file, the key and the remedy.
     """
     path = Path(path)
     if not path.suffix and not path.is_file():
@@ -448,7 +465,10 @@ def read_cell(path: str | Path) -> Workcell:
 
 
 def parse_cell(data: bytes, path: Path) -> Workcell:
-    """Parse and validate the content of a cell file for `path`; errors as `read_cell`."""
+    """Parse and validate the content of a cell file; the URDF that it names is read, too.
+
+    ``path``: of the file, to which the URDF is relative. Raises InputError as `read_cell`.
+    """
     cell = read_yaml(data, path, Workcell)
     urdf = path.parent / cell.robot.urdf
     cell.file = str(path)
@@ -464,7 +484,10 @@ def parse_cell(data: bytes, path: Path) -> Workcell:
 
 
 def _check(path: Path, cell: Workcell, text: str) -> None:
-    """Raise InputError for unknown names and contradictory values."""
+    """Raise InputError for unknown names and contradictory values, with the line in the file.
+
+    ``text``: of the cell file.
+    """
     try:
         chain = cell.chain()
     except InputError as error:

@@ -78,7 +78,10 @@ class Expansion:
         xacro.parse = self._parsed
 
     def text(self, arguments: dict[str, str]) -> str:
-        """Return the file as URDF text."""
+        """Return the file as URDF text; ``arguments``: of xacro, by name.
+
+        Raises InputError for what is not supported, and any error of xacro.
+        """
         document = xacro.process_file(str(self._path), mappings=arguments)
         text: str = document.documentElement.toprettyxml(indent='  ')
         return text
@@ -238,6 +241,7 @@ def _here() -> str:
 
 
 def _refused(what: str, why: str) -> InputError:
+    """Return the InputError for an expression or substitution (``what``) that is not supported."""
     return InputError(f'{_here()}: {what:.200}: {why}; correct it, or {_TRUST}')
 
 
@@ -247,6 +251,7 @@ def _converted(value: Any) -> Any:
 
 
 def _show(*given: Any, **_: Any) -> str:
+    """Print a message of xacro to stderr; return ''."""
     print(*given, file=sys.stderr)
     return ''
 
@@ -263,7 +268,10 @@ def _tokens(text: str, sep: str = ',; ', skip_empty: bool = True) -> list[str]:
 
 
 def _line(path: Path, error: BaseException) -> str:
-    """Return an error as one line, with the file and the remedy."""
+    """Return an error as one line, with the file and the remedy.
+
+    The text of an InputError among its causes is the line itself.
+    """
     inner: BaseException | None = error
     while inner is not None:
         if isinstance(inner, InputError):

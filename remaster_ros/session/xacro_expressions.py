@@ -62,9 +62,10 @@ def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
 
 
 def global_names(**functions: Any) -> dict[str, Any]:
-    """Return name -> value for every expression: Python's, math's, `functions` in ``xacro``.
+    """Return name -> value for every expression: Python's, math's, ``functions`` in ``xacro``.
 
-    The caller provides replacements of functions with side effects.
+    load_yaml, abs_filename and dotify among them are known without the prefix, too. The caller
+    provides replacements of functions with side effects.
     """
     xacro = Namespace({name: Function(call) for name, call in functions.items()})
     return {
@@ -92,7 +93,7 @@ class _Evaluation:
         return visit(node)
 
     def _data(self, node: ast.expr) -> Any:
-        """Return a value; raise ExpressionError if it is a function."""
+        """Return the value of a node; raise ExpressionError if it is a function or a namespace."""
         value = self.of(node)
         if isinstance(value, Function | Namespace):
             raise ExpressionError(f'{ast.unparse(node)} is a function and no value')
@@ -171,12 +172,15 @@ class _Evaluation:
         return True
 
     def _of_IfExp(self, node: ast.IfExp) -> Any:
+        """Value of ``a if test else b``; only the chosen part is evaluated."""
         return self._data(node.body if self._data(node.test) else node.orelse)
 
     def _of_List(self, node: ast.List) -> Any:
+        """List of evaluated parts."""
         return [self._data(part) for part in node.elts]
 
     def _of_Tuple(self, node: ast.Tuple) -> Any:
+        """Tuple of evaluated parts."""
         return tuple(self._data(part) for part in node.elts)
 
     def _of_Dict(self, node: ast.Dict) -> Any:
@@ -216,14 +220,20 @@ class _Evaluation:
 
 
 def _item(holder: Any, key: Any) -> Any:
-    """Return an item of a list, dictionary or text; raise ExpressionError if there is none."""
+    """Return an item of a list, tuple, dictionary or text.
+
+    Raises ExpressionError if a dictionary lacks the key, IndexError or TypeError for other values.
+    """
     if isinstance(holder, dict) and key not in holder:
         raise ExpressionError(f'there is no item {key!r}')
     return holder[key]
 
 
 def _bounded(value: Any) -> Any:
-    """Return a value; raise ExpressionError if it is too large."""
+    """Return a value unchanged; raise ExpressionError if it is too large or complex.
+
+    Too large: an integer above 4096 bits (`MOST_BITS`), or over 100,000 characters or items.
+    """
     if isinstance(value, complex):
         raise ExpressionError('no real number')
     if isinstance(value, int) and value.bit_length() > MOST_BITS:
@@ -247,14 +257,17 @@ def _count(value: Any, left: int) -> int:
 
 
 def _length(value: Any) -> int:
-    """Return the size of a number or text: bits, or characters and items."""
+    """Return the size of a number or text: bits, or characters and items; 0 for other values."""
     if isinstance(value, int):
         return value.bit_length()
     return len(value) if isinstance(value, str | list | tuple) else 0
 
 
 def _times(left: Any, right: Any) -> Any:
-    """Return a product; raise ExpressionError if it would be too large."""
+    """Return a product, also of a text or list and a number.
+
+    Raises ExpressionError if a text or list would be longer than `LONGEST`, or for other values.
+    """
     for text, count in ((left, right), (right, left)):
         if isinstance(text, str | list | tuple) and isinstance(count, int):
             if len(text) * count > LONGEST:
@@ -264,7 +277,7 @@ def _times(left: Any, right: Any) -> Any:
 
 
 def _power(left: Any, right: Any) -> Any:
-    """Return a power; raise ExpressionError if it would be too large."""
+    """Return left ** right; ExpressionError for no numbers, or over `MOST_BITS` bits."""
     base, exponent = _number(left), _number(right)
     whole = isinstance(base, int) and isinstance(exponent, int)
     if whole and _length(base) * abs(exponent) > MOST_BITS:
@@ -280,7 +293,7 @@ def _plus(left: Any, right: Any) -> Any:
 
 
 def _number(value: Any) -> Any:
-    """Return a number; raise ExpressionError for another value."""
+    """Return a number (int, float or bool); raise ExpressionError for another value."""
     # Also of %, which formats a text.
     if not isinstance(value, int | float):
         raise ExpressionError(f'{value!r:.40} is no number')
@@ -288,11 +301,15 @@ def _number(value: Any) -> Any:
 
 
 def _of_numbers(operate: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Return an operator that raises ExpressionError unless both values are numbers."""
     return lambda left, right: operate(_number(left), _number(right))
 
 
 def _replace(text: str, old: str, new: str) -> str:
-    """Return text with a replaced part; raise ExpressionError if it would be too long."""
+    """Return text with every ``old`` replaced; raise ExpressionError if it would be too long.
+
+    Too long: the replacements together over 100,000 characters (`LONGEST`).
+    """
     if text.count(old) * len(new) > LONGEST:
         raise ExpressionError('a text that is too long')
     return text.replace(old, new)
@@ -300,6 +317,7 @@ def _replace(text: str, old: str, new: str) -> str:
 
 def _round(value: Any, ndigits: int = 0) -> Any:
     # That of a whole number works out 10 to the power of the digits.
+    """Return a rounded number, digits limited to 400; a whole number without digits."""
     return round(_number(value), max(-400, min(ndigits, 400))) if ndigits else round(value)
 
 

@@ -32,7 +32,10 @@ Record = TypeVar('Record', bound=msgspec.Struct)
 
 
 def key_lines(text: str) -> dict[Keys, int]:
-    """Return the line number, from 1, of every key of YAML text; {} if it is not YAML."""
+    """Return the line number, from 1, of every key of YAML text by its path; {} if it is not YAML.
+
+    Keys in lists are not counted.
+    """
     lines: dict[Keys, int] = {}
 
     def visit(node: Any, path: Keys) -> None:
@@ -50,7 +53,7 @@ def key_lines(text: str) -> dict[Keys, int]:
 
 
 def with_line(text: str, problem: str) -> str:
-    """Return a problem that begins with a dotted key, preceded by the line of the key."""
+    """Return a problem that begins with a dotted key, with 'line N: ' if the key is found."""
     key = problem.split(maxsplit=1)[0].rstrip(':')
     line = key_lines(text).get(tuple(key.split('.')))
     return f'line {line}: {problem}' if line else problem
@@ -85,7 +88,10 @@ def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
 
 
 def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: Keys) -> bool:
-    """Return whether a file with only the entry at this path would be refused."""
+    """Return whether a file with only the entry at this path would be refused as the record.
+
+    ``steps``: place in msgspec's message, with [...] for unknown keys, as long as ``path``.
+    """
     content = load_yaml(text)
     here = content
     for step, key in zip(steps, path):
@@ -101,7 +107,7 @@ def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: K
 
 
 def _fields(record: type[msgspec.Struct], steps: list[str]) -> list[str]:
-    """Return the keys of a nested record at some steps into a record."""
+    """Return the keys of a nested record at some steps into a record; [] if that is no record."""
     kind: Any = msgspec.inspect.type_info(record)
     for step in steps:
         kind = _record_of(kind)
@@ -116,14 +122,14 @@ def _fields(record: type[msgspec.Struct], steps: list[str]) -> list[str]:
 
 
 def _record_of(kind: Any) -> Any:
-    """Return a type without None."""
+    """Return the first type of a union that is not None; other types unchanged."""
     if isinstance(kind, msgspec.inspect.UnionType):
         kind = next(t for t in kind.types if not isinstance(t, msgspec.inspect.NoneType))
     return kind
 
 
 def to_plain(value: Any) -> Any:
-    """Return a dataclass, struct or container as plain data; floats are exact."""
+    """Return a dataclass, struct or container as plain data; floats are exact, arrays lists."""
     return msgspec.to_builtins(value, enc_hook=lambda array: array.tolist())
 
 
@@ -154,7 +160,7 @@ def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -
 
 @cache
 def _hints(record: type) -> dict[str, Any]:
-    """Return the annotations of a record."""
+    """Return the annotations of a record by field, with the bounds in them."""
     return get_type_hints(record, include_extras=True)
 
 
