@@ -64,7 +64,10 @@ class PoseRanges:
             raise InputError(f'planning: radius_m starts at {self.radius_m[0]}; it must be >= 0')
 
     def contain(self, places: FloatArray) -> BoolArray:
-        """Return whether points (n, 3), m in R, lie in the ranges, (n,)."""
+        """Whether points (n, 3), m in R, lie in the ranges of cylinder coordinates, (n,).
+
+        Bounds are inside; azimuths count modulo whole turns. The roll is not looked at.
+        """
         x, y, height = places.T
         # Angle from the lower azimuth, modulo whole turns.
         angle = (np.arctan2(y, x) - self.azimuth_rad[0]) % (2 * np.pi)
@@ -130,7 +133,9 @@ class PlanningScene:
         """Draw candidate poses that face one sensor; return the usable ones.
 
         ``count``: number of candidates; ``sensors_R``: position in R of each sensor that has to
-        see its marker, m, (3,); ``rng``: source of randomness.
+        see its marker, m, (3,); the tool faces `aim_at`, at its rough position if that is not
+        among them; ``rng``: source of randomness. An arm with fewer than six joints gets reachable
+        poses near the candidates. Raises InputError as `candidate_poses`.
         """
         # A sensor that is not required may be unregistered.
         aim = {**self.rough_R, **sensors_R}[self.aim_at]
@@ -236,7 +241,7 @@ def plan_poses(
     ``arm``: the same arm with its obstacles; ``candidates``: T_R_T, (n, 4, 4); ``lines_of_sight``:
     markers that have to be visible; ``limit_margin_rad``: distance to keep from the joint limits,
     rad; of a prismatic joint `SerialChain.per_radian` times as much, m. The numbers of poses and
-    of dropped poses add up to n.
+    of dropped poses add up to n; poses are in the order of the candidates. No pose is no error.
     """
     chain = inverse_kinematics.chain
     reachable = inverse_kinematics.solutions_of_each(candidates)
@@ -268,7 +273,10 @@ def plan_poses(
 def _reasons(
     arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
-    """Return the first reason to drop each solution (m, k), '' if it is usable, (m,)."""
+    """Return the first reason to drop each solution (m, k), '' if it is usable, (m,).
+
+    Collisions (nearer than `RESERVE_M`) come first, then each line of sight in order.
+    """
     # More clearance than the bridge requires: an arm slightly off its path may still move.
     collisions = arm.reasons(q, RESERVE_M)
     bad = [collisions != '', *(_is_hidden(arm, q, sight) for sight in lines_of_sight)]
@@ -277,7 +285,10 @@ def _reasons(
 
 
 def _is_hidden(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
-    """Return whether the marker faces away from the sensor or the arm hides it, (m,)."""
+    """Whether the marker faces away from the sensor or the arm hides it, (m,).
+
+    It faces away beyond `max_angle_rad`. ``q``: rad or m, (m, k).
+    """
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)
     facing = np.sum(T[:, :3, 2] * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)

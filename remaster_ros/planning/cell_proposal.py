@@ -61,10 +61,13 @@ class HeldJoint:
 def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     """Return the joint that gives poses the most joint solutions if it is held.
 
-    A joint that leaves an arm with a closed form, or near one, is preferred: solutions are then
-    found a hundred times as fast, and none is missed.
+    None of an arm with `FEWEST_JOINTS` to six joints. A joint that leaves an arm with a closed
+    form, or near one, is preferred: solutions are then found a hundred times as fast, and none is
+    missed. A slide is held at `SHARES` of its travel; another joint at up to three values if its
+    poses have fewer than `FEW_SOLUTIONS`.
 
     ``facing``: tool poses to try, (n, 4, 4), such as those drawn from `widest_ranges`.
+
     Raises InputError if the arm has fewer than three or more than seven joints, or is singular at
     all configurations whichever joint is held.
     """
@@ -119,7 +122,11 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
 
 
 def _resting(chain: SerialChain, joint: int) -> float:
-    """Return a position to hold a joint at, rad or m: 0 if well inside limits, or mid-range."""
+    """Return a position to hold a joint at, rad or m: 0 if well inside limits, or mid-range.
+
+    Well inside is at least a fifth of the range from both limits; without limits 0; of a slide
+    always the middle. The middle of a joint that turns is rounded to 5 degrees.
+    """
     low, high = chain.lower[joint], chain.upper[joint]
     if chain.slides[joint]:
         return float(low + high) / 2
@@ -136,7 +143,7 @@ def _random_joints(chain: SerialChain, count: int, rng: np.random.Generator) -> 
 
 
 def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
-    """Return the mean number of usable joint solutions of poses (n, 4, 4)."""
+    """Return the mean number of usable joint solutions of poses (n, 4, 4), n >= 1."""
     solutions = kinematics.solutions_of_each(poses)
     return float(np.mean([len(kinematics.usable(q)) for q in solutions]))
 
@@ -152,7 +159,7 @@ class Reach:
 
 
 def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
-    """Return the extent of the workspace, estimated from random configurations."""
+    """Return the extent of the workspace, estimated from 3,000 random configurations."""
     places = chain.forward(_random_joints(chain, 3000, rng))[:, :3, 3]
     first = chain.T_fixed[0]
     radius = np.linalg.norm((places - first[:3, 3])[:, :2], axis=1)
@@ -160,7 +167,10 @@ def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
 
 
 def link_radius(reach: Reach, full_size: float) -> float:
-    """Return the radius of an arm's links, m, from that of full-size arms."""
+    """Return the radius of an arm's links, m, from that of full-size arms (`FULL_SIZE_M`).
+
+    In proportion to the reach, no larger than `full_size`, rounded to mm.
+    """
     return round(full_size * min(reach.reach_m / FULL_SIZE_M, 1.0), 3)
 
 
@@ -172,8 +182,9 @@ def facing_angle_deg(
 ) -> float:
     """Return the largest angle between tool axis and line to a sensor at usable poses, degrees.
 
-    `max_angle_deg`, unless the arm cannot turn its tool so far, like a SCARA, whose tool stays
-    upright: then an angle within which nearly all of its poses face the sensor.
+    `max_angle_deg` if at least `FACING` of 3,000 random poses face the sensor within it. Else the
+    arm cannot turn its tool so far, like a SCARA, whose tool stays upright: then an angle, in
+    steps of 5, within which a share `MOST` of its poses face the sensor. ``sensor_R``: m, (3,).
     """
     T = chain.forward(_random_joints(chain, 3000, rng))
     to_sensor = sensor_R - T[:, :3, 3]
@@ -185,7 +196,11 @@ def facing_angle_deg(
 
 
 def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
-    """Return ranges of poses that cover the whole workspace above the floor."""
+    """Return ranges of poses that cover the whole workspace above the floor.
+
+    ``floor_z``: height of the floor, m, None for none; a tenth of the reach above it is kept.
+    Radii begin at 0.15 times the reach.
+    """
     lowest = reach.low_m if floor_z is None else max(reach.low_m, floor_z + 0.1 * reach.reach_m)
     return PoseRanges(
         azimuth_rad=(-np.pi, np.pi),
@@ -195,7 +210,11 @@ def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
 
 
 def ranges_around(places: FloatArray) -> PoseRanges:
-    """Return ranges around the middle of reachable tool positions, m, (n, 3)."""
+    """Return ranges around the middle of reachable tool positions, m, (n, 3), n >= 1.
+
+    Quantiles 0.1 to 0.9 of radius and height, in steps of 1 cm; 0.05 to 0.95 of azimuth, in steps
+    of 5 degrees, or a whole turn if that is wider than 300 degrees.
+    """
     radius = np.quantile(np.linalg.norm(places[:, :2], axis=1), (0.1, 0.9))
     height = np.quantile(places[:, 2], (0.1, 0.9))
     azimuth = np.quantile(np.arctan2(places[:, 1], places[:, 0]), (0.05, 0.95))
@@ -210,9 +229,9 @@ def ranges_around(places: FloatArray) -> PoseRanges:
 def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float) -> float:
     """Return a position on the tool's Z axis at which a marker is clear of the arm, m.
 
-    In front of the last link, or negative if Z points back along the arm.
-
-    ``bodies``: the collision geometry; ``link_radius``: of the links in the line of sight, m.
+    In front of the last link, or negative if Z points back along the arm. `CLEAR_M` from last and
+    previous link, rounded up to cm, at least `LEAST_MARKER_M`. ``bodies``: the collision geometry;
+    ``link_radius``: of the links in the line of sight, m.
     """
     # The previous link ends at the last joint's origin.
     T_T_joint = inverse(chain.T_fixed[-1])
@@ -236,6 +255,6 @@ def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float
 
 
 def _rounded(values: FloatArray, step: float) -> tuple[float, float]:
-    """Return a range rounded to multiples of a step."""
+    """Return the two ends of a range, each rounded to the nearest multiple of a step."""
     low, high = np.round(values / step) * step
     return float(low), float(high)

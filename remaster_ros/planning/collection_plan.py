@@ -132,7 +132,9 @@ def look_ahead(
     """Plan the remaining visits of tours, the collection's last, without changing the tours.
 
     ``tours``: one after the other; ``visit``: remaining visit of the pose under way, which comes
-    first; other arguments as of `plan_collection`.
+    first; other arguments as of `plan_collection`. If the poses do not determine the offsets, the
+    plan has `undetermined`.
+
     Raises InsufficientDataError if no configuration can be reached.
     """
     configurations = sum(sum(tour.configurations.values()) for tour in tours)
@@ -248,7 +250,10 @@ def count_with_free_path(
 
 
 def _reached(tour: Tour, q: FloatArray, enough: int, most_missed: int) -> tuple[int, int]:
-    """Count poses to fit with a free path, and poses tried, until `enough` or too many missed."""
+    """Count poses to fit with a free path, and poses tried, along a tour from q, rad, (k,).
+
+    Until `enough` are found, `most_missed` have no path, or the tour ends. The tour is changed.
+    """
     count = tried = missed = 0
     while count < enough and missed < most_missed and (visit := tour.next(q)) is not None:
         tried += visit.split == FITTED
@@ -290,7 +295,10 @@ class _Steps:
         self.unreached: list[tuple[str, int, int]] = []
 
     def go(self, visit: PoseVisit) -> None:
-        """Add the motions to all solutions of a visit."""
+        """Add the motions to all solutions of a visit, from `here`, which becomes the last one.
+
+        Solutions without a path are added to `unreached`.
+        """
         self.unreached += [(visit.split, visit.index, number) for number in visit.unreached]
         for q, waypoints in zip(visit.solutions, visit.paths, strict=True):
             trajectory, speed = self._travel.trajectory(np.vstack((self.here, waypoints, q)))
@@ -302,7 +310,10 @@ class _Steps:
 def expected_precision(
     planner: TourPlanner, T_R_N: Mapping[str, FloatArray], poses: Sequence[PlannedPose]
 ) -> Expected:
-    """Return the expected precision of a fit of these poses in all their solutions."""
+    """Return the expected precision of a fit of these poses in all their solutions.
+
+    ``T_R_N``: registrations, (4, 4); other sensors are left out. Raises as `DesignInformation.of`.
+    """
     sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
     information = planner.design.with_sensors_at(sensors_R).information(planner.scene, poses)
     chosen = range(len(information))

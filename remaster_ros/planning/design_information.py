@@ -176,7 +176,7 @@ class DesignInformation:
         return len(self.q)
 
     def only(self, kept: IntArray) -> DesignInformation:
-        """Return the information of some configurations alone, in this order."""
+        """Return the information of some configurations alone; ``kept``: indices, in order."""
         return replace(
             self,
             q=self.q[kept],
@@ -188,7 +188,8 @@ class DesignInformation:
     def whole_poses(self) -> tuple[DesignInformation, list[IntArray]]:
         """Return the information of poses with all their configurations, and their indices.
 
-        Poses have no error in common, so that their information adds up.
+        Poses have no error in common, so that their information adds up. They are in the order of
+        their numbers; `q` is the first configuration of each.
         """
         members = [np.flatnonzero(self.pose == index) for index in np.unique(self.pose)]
         sums = np.array([self.weighted[indices].sum(axis=0) for indices in members])
@@ -205,7 +206,10 @@ class DesignInformation:
         return poses, members
 
     def total(self, chosen: Sequence[int]) -> FloatArray:
-        """Information of chosen configurations and priors, (f, f), less what poses share."""
+        """Information of chosen configurations and priors, (f, f), less what poses share.
+
+        ``chosen``: their indices; () gives the priors alone. In units of `scale`.
+        """
         which = np.array(chosen, dtype=np.int64)
         sums, count = self._sums(chosen)
         visited = np.flatnonzero(count)
@@ -240,14 +244,17 @@ class DesignInformation:
         return result
 
     def _sums(self, chosen: Sequence[int]) -> tuple[FloatArray, IntArray]:
-        """Return the sum of J/v over each pose's chosen, (poses, s, 3, f), and their number."""
+        """Return the sum of J/v over each pose's chosen, (poses, s, 3, f), and their number.
+
+        Poses without a chosen configuration have 0.
+        """
         which = np.array(chosen, dtype=np.int64)
         sums = np.zeros((int(self.pose.max()) + 1, *self.weighted.shape[1:]))
         np.add.at(sums, self.pose[which], self.weighted[which])
         return sums, np.bincount(self.pose[which], minlength=len(sums))
 
     def _factor(self, count: IntArray) -> FloatArray:
-        """Return pose_sigma² / (1 + m pose_sigma² / v) for frame counts m (p,), (p, s)."""
+        """Return pose_sigma² / (1 + m pose_sigma² / v) for frame counts m (p,), (p, s), m²."""
         return self.pose_variance / (1.0 + count[:, None] * self.pose_variance * self.weight)
 
     def _shared(self, sums: FloatArray, count: IntArray) -> FloatArray:
@@ -259,11 +266,15 @@ class DesignInformation:
         return _squares(rooted.reshape(len(sums), 3 * len(self.weight), len(self.scale)))
 
     def covariance(self, chosen: Sequence[int]) -> FloatArray:
-        """Return the expected covariance of the free parameters, rad and m, (f, f)."""
+        """Return the expected covariance of the free parameters, rad and m, (f, f).
+
+        ``chosen``: indices of configurations. Directions that nothing determines have a large
+        variance (`UNKNOWN`), not an infinite one.
+        """
         return np.linalg.inv(self.finite(self.total(chosen))) * np.outer(self.scale, self.scale)
 
     def finite(self, information: FloatArray) -> FloatArray:
-        """Return information (..., f, f) made invertible where the data determine nothing."""
+        """Return information (..., f, f) with a ridge (`UNKNOWN`), so that it can be inverted."""
         return information + UNKNOWN * np.eye(len(self.scale))
 
     def joint_std(self, chosen: Sequence[int]) -> dict[str, float | None]:
@@ -279,7 +290,8 @@ class DesignInformation:
     def joint_rms(self, chosen: Sequence[int]) -> float:
         """Return the root mean square of the identifiable joints' standard deviations, rad.
 
-        That of a prismatic joint is divided by `SerialChain.per_radian`.
+        That of a prismatic joint is divided by `SerialChain.per_radian`. NaN if no joint is
+        identifiable.
         """
         std = [
             value / unit
@@ -289,13 +301,19 @@ class DesignInformation:
         return float(np.sqrt(np.mean(np.square(std))))
 
     def tool_rms(self, chosen: Sequence[int]) -> float:
-        """Return the root mean square 3-D error of the predicted markers in the box, m."""
+        """Return the root mean square 3-D error of the predicted markers in the box, m.
+
+        ``chosen``: indices of configurations; the mean is over all candidates in the box.
+        """
         covariance = np.linalg.inv(self.finite(self.total(chosen)))
         return float(np.sqrt(np.sum(covariance * self.tool)))
 
 
 def nominal_context(model: Model, x: FloatArray, measurements: Measurements) -> Context:
-    """Return the context of effects at the nominal arm, without times and previous moves."""
+    """Return the context of effects at the nominal arm, without times and previous moves.
+
+    ``x``: nominal parameters, (size,).
+    """
     return Context(
         model.chain,
         measurements,

@@ -43,7 +43,7 @@ class ToolBox:
     size_m: FloatArray  # Edge lengths, (3,)
 
     def holds(self, points: FloatArray) -> BoolArray:
-        """Return whether points (n, 3), m, lie in the box, (n,)."""
+        """Whether points (n, 3), m in R, lie in the box, its faces included, (n,)."""
         return np.all(2.0 * np.abs(points - self.center_m) <= self.size_m, axis=-1)
 
 
@@ -77,9 +77,10 @@ def nominal_model(
 def expected_priors(
     model: Model, x: FloatArray, marker_std_m: float, priors: Priors
 ) -> tuple[Prior, ...]:
-    """Return the priors of a fit; only the widths of those on offsets matter here.
+    """Return the priors of a fit: of all markers, then bases and offsets that are given.
 
-    ``x``: nominal parameters; ``marker_std_m``: of marker positions without a prior, per axis.
+    Only the widths of those on offsets matter here. ``x``: nominal parameters; ``marker_std_m``:
+    of marker positions without a prior, per axis. Raises ValueError if a name is not in the model.
     """
     markers = model.markers(x)
     prior_list = [
@@ -102,7 +103,8 @@ def expected_measurements(
 ) -> Measurements:
     """Return measurements with a row for every marker of every sensor at every configuration.
 
-    ``q``: rad, (n, k); ``pose``: number of the pose of each configuration, (n,). Positions are 0.
+    Sensor by sensor, then by configuration. ``q``: rad, (n, k); ``pose``: number of the pose of
+    each configuration, (n,). Positions are 0; previous configurations and temperatures NaN.
     """
     configuration, sensor, marker = (
         np.concatenate(parts)
@@ -140,7 +142,10 @@ def expected_measurements(
 def expected_rows(
     model: Model, x: FloatArray, measurements: Measurements, sensors: Sequence[ExpectedSensor]
 ) -> Rows:
-    """Return rows whose targets are predictions at x, displaced by the expected noise."""
+    """Return rows whose targets are predictions at x, displaced by the expected noise.
+
+    Each coordinate by the root of the sum of squares of the sensor's three noises, m.
+    """
     rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
     target = model.predict(model.pinned(x), rows)
     for index, span in rows.spans:

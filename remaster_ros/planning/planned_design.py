@@ -69,7 +69,7 @@ class DesignSettings:
         return replace(self, sensors=tuple(placed))
 
     def information(self, scene: PlanningScene, poses: Sequence[PlannedPose]) -> DesignInformation:
-        """Return the information of poses; errors as of `DesignInformation.of`."""
+        """Return the information of poses. Raises as `DesignInformation.of`."""
         chain = scene.model.chain
         return DesignInformation.of(
             chain, poses, self.sensors, self.marker_std_m, self.priors, self.box
@@ -110,9 +110,12 @@ def designed_plans(
 
     ``scene, settings``: see there; ``plans``: of Latin hypercubes, by split; the poses to fit are
     among the candidates, so that the precision of these plans can be reached; of the validation
-    poses as many are kept as are needed; ``sensors_R``: position in R of each sensor that has to
-    see its marker, m, (3,); ``travel``: cost of configurations; ``rng``: for candidates and
-    choice.
+    poses the first `HELD_OUT_POSES` are kept; ``sensors_R``: position in R of each sensor that has
+    to see its marker, m, (3,); ``travel``: cost of configurations; ``rng``: for candidates and
+    choice. If a chosen configuration has no path to the others, the choice is repeated without it,
+    at most `MOST_TRIES` times.
+
+    Raises InputError and InsufficientDataError as `DesignInformation.of` and `Goal.weights`.
     """
     plan, pool = plans['optimization'], scene.plan(POOL_CANDIDATES, sensors_R, rng)
     poses = [*plan.poses, *pool.poses]
@@ -188,7 +191,10 @@ def _floors(information: DesignInformation, candidates: IntArray, whole_poses: b
 
 
 def _held_out(plan: Plan, solutions: int | None, rng: np.random.Generator) -> Plan:
-    """Return the first validation poses, and of each all solutions (None) or a random few."""
+    """Return the first `HELD_OUT_POSES` validation poses, the others counted as not needed.
+
+    ``solutions``: how many of each are drawn at random; None for all.
+    """
     kept = tuple(
         PlannedPose(
             pose.T_R_T,

@@ -66,7 +66,10 @@ class Floors:
     repeated: int = REPEATED_POSES  # Poses with at least two solutions
 
     def hold(self, pose: IntArray) -> bool:
-        """Return whether configurations of these poses (n,) are enough."""
+        """Whether configurations of these poses (n,) are enough.
+
+        ``pose``: number of the pose of each configuration.
+        """
         count = np.unique(pose, return_counts=True)[1]
         return len(count) >= self.poses and int(np.sum(count > 1)) >= self.repeated
 
@@ -85,7 +88,8 @@ class Goal:
     def weights(self, information: DesignInformation) -> FloatArray:
         """Return L (f, r) with criterion trace(L' M^-1 L), which is at most 1 at the goal.
 
-        Raises InsufficientDataError if no joint is identifiable.
+        M is an information matrix. In a mixture each part has its share (`tool_share`). Raises
+        InsufficientDataError if no joint is identifiable, unless only the tool counts.
         """
         parts = []
         if self.tool_share < 1.0:
@@ -104,7 +108,10 @@ class Goal:
         return np.concatenate(parts, axis=1)
 
     def is_met(self, joint_rms: float, tool_rms: float) -> bool:
-        """Return whether standard deviations of joints, rad, and tool, m, reach the goal."""
+        """Whether standard deviations of joints, rad, and tool, m, reach the goal.
+
+        The one without weight does not count.
+        """
         joints = self.tool_share == 1.0 or joint_rms <= self.joint_std_rad
         return joints and (self.tool_share == 0.0 or tool_rms <= self.tool_std_m)
 
@@ -143,8 +150,9 @@ def choose(
 
     ``information``: of all candidates; ``travel``: their cost; ``goal, floors``: what to reach;
     ``rng``: for exchanges; ``most``: largest number of configurations; ``exchanges``: largest
-    number tried; ``whole_poses``: choose poses with all their configurations, not single ones.
-    If the goal cannot be reached, the design has `reached` False and `most` configurations or all.
+    number tried; ``whole_poses``: choose poses with all their configurations, not single ones. If
+    the goal cannot be reached, the design has `reached` False and `most` configurations or all;
+    the last pose may exceed `most`. Raises InsufficientDataError as `Goal.weights`.
     """
     units = _Units(information, travel, whole_poses)
     search = _Search(units, goal, floors)
@@ -186,7 +194,10 @@ class _Units:
         self._near: dict[int, FloatArray] = {}
 
     def _time_within(self, q: FloatArray) -> float:
-        """Return the mean time through all solutions (m, k) of a pose, nearest next, s."""
+        """Return the mean time through all solutions (m, k) of a pose, nearest next, s.
+
+        The mean over the solution begun with; solutions in the order of their time from it.
+        """
         times = self._travel.between(q)
         order = np.argsort(times, axis=1)
         along = np.take_along_axis(times[order[:, :-1]], order[:, 1:, None], axis=2)
@@ -216,7 +227,7 @@ class _Units:
         return self._near[index]
 
     def configurations(self, chosen: Sequence[int]) -> tuple[int, ...]:
-        """Return the configurations of chosen units."""
+        """Return the indices of the configurations of chosen units, unit by unit."""
         return tuple(int(each) for index in chosen for each in self.members[index])
 
 
@@ -236,7 +247,8 @@ class _Search:
     def _with_each(self, chosen: Sequence[int], allowed: BoolArray) -> tuple[IntArray, FloatArray]:
         """Return the most promising units of those allowed, and the criterion with each, (m,).
 
-        ``allowed``: (n,); the most promising are selected to first order if there are many.
+        ``allowed``: (n,), less the chosen ones. Of more than `LOOKED_AT` after `FIRST` chosen
+        ones, those with the largest gain to first order for their time.
         """
         information = self._information
         allowed = allowed.copy()
@@ -253,7 +265,10 @@ class _Search:
         return candidates, self._criteria(information.with_each(chosen, candidates))
 
     def _times(self, chosen: Sequence[int]) -> FloatArray:
-        """Return each unit's addition to the robot time of the chosen units, s, (n,)."""
+        """Return each unit's addition to the robot time of the chosen units, s, (n,).
+
+        From the nearest chosen unit, and for measuring; without chosen ones for measuring alone.
+        """
         if not chosen:
             return self._units.stay_s
         near = np.min([self._units.near(index) for index in chosen], axis=0)
@@ -271,7 +286,11 @@ class _Search:
         return np.repeat(self._information.pose[which], self._units.solutions[which])
 
     def _best_addition(self, chosen: Sequence[int]) -> int:
-        """Return the unit with the largest gain for its time."""
+        """Return the unit with the largest gain for its time, raised to `URGENCY`.
+
+        The gain is the decrease of the criterion's logarithm. If the goal is reached, a unit that
+        the floors lack; of whole poses then the one of least time. A unit must be left.
+        """
         allowed = np.ones(len(self._information), bool)
         if chosen and self._goal.is_reached(self._information, chosen):
             missing = self._missing(chosen)
@@ -288,7 +307,7 @@ class _Search:
         )
 
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
-        """Return whether each unit brings the design nearer to the floors, (n,)."""
+        """Whether each unit brings the design nearer to the floors, (n,)."""
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
         poses, repeated = np.sum(count > 0), np.sum(count > 1)
@@ -300,7 +319,10 @@ class _Search:
         return new
 
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
-        """Return the units extended until the design is done or has `most` configurations."""
+        """Return the units extended until the design is done or has `most` configurations.
+
+        Also without reaching the goal, when all units are chosen.
+        """
         chosen = list(chosen)
         while len(chosen) < len(self._information) and not self.is_done(chosen):
             if len(self._poses(chosen)) >= most:
@@ -309,7 +331,11 @@ class _Search:
         return chosen
 
     def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
-        """Return a random exchange: a pose added, or a few removed and the design filled up."""
+        """Return a random exchange: a pose added, or a few removed and the design filled up.
+
+        Each with probability 1/2; up to four poses are removed, and `MOST_MORE` configurations
+        more than before allowed. Unchanged if no pose is left to add.
+        """
         pose = self._information.pose
         poses_in = np.unique(pose[np.array(chosen, dtype=np.int64)])
         if rng.random() < 0.5:
@@ -324,14 +350,20 @@ class _Search:
         return self.filled(remaining, len(self._poses(chosen)) + MOST_MORE)
 
     def thinned(self, chosen: Sequence[int]) -> list[int]:
-        """Return the design with superfluous units removed."""
+        """Return the design with superfluous units removed, the least useful first.
+
+        It stays done; at least one unit remains.
+        """
         chosen = list(chosen)
         while len(chosen) > 1 and self.is_done(fewer := self._without_least(chosen)):
             chosen = fewer
         return chosen
 
     def _without_least(self, chosen: Sequence[int]) -> list[int]:
-        """Return the design without its least useful unit, floors kept if possible."""
+        """Return the design without its least useful unit, floors kept if possible.
+
+        Least is log criterion + `URGENCY` log robot time of what remains.
+        """
         which = np.array(chosen, dtype=np.int64)
         without = [[kept_unit for kept_unit in chosen if kept_unit != index] for index in chosen]
         matrices = np.array([self._information.total(remaining) for remaining in without])

@@ -57,7 +57,7 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
     tool_box: ToolBoxSettings | None = None
 
     def ranges(self) -> PoseRanges:
-        """Return the ranges in SI units."""
+        """Return the ranges in SI units. Raises InputError as `PoseRanges`."""
         return PoseRanges(
             azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
             radius_m=self.radius_m,
@@ -66,7 +66,10 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def settings(self, sensors: tuple[ExpectedSensor, ...], marker_std_m: float) -> DesignSettings:
-        """Return the settings of the design, in SI units."""
+        """Return the settings of the design, in SI units, for these sensors.
+
+        ``marker_std_m``: prior of the markers' positions, per axis, m.
+        """
         # Imported when needed, here and below: most nodes plan nothing.
         from remaster_ros.planning.planned_design import DesignSettings
 
@@ -84,7 +87,7 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def given(self) -> Mapping[str, object]:
-        """Return the keys that differ from their defaults, ranges excepted."""
+        """Return the keys that differ from their defaults, with values; ranges excepted."""
         plain = PoseSettings()
         return {
             key: getattr(self, key)
@@ -93,7 +96,10 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         }
 
     def problem(self) -> str:
-        """First contradiction between keys; '' if there is none."""
+        """First contradiction between keys, as a line with the remedy; '' if there is none.
+
+        Also a descending range, angles that look like radians, and unknown words.
+        """
         for key in RANGES:
             low, high = getattr(self, key)
             if low > high:
@@ -116,7 +122,7 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         return self._without_effect()
 
     def _without_effect(self) -> str:
-        """First key that has no effect with the others; '' if there is none."""
+        """First key that has no effect with the others, with the remedy; '' if there is none."""
         given = self.given()
         if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
             return (

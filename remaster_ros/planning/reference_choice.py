@@ -42,7 +42,10 @@ class Cause:
 
 
 def rigid(points: FloatArray, center: FloatArray) -> FloatArray:
-    """Return the Jacobian of points (n, 3) by a rigid motion about `center`, (n, 3, 6)."""
+    """Return the Jacobian of points (n, 3) by a rigid motion about `center`, (n, 3, 6).
+
+    Columns: translation along x, y, z, then rotation about them, per rad.
+    """
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     # Column i: the velocity at a turn about axis i, e_i × (point - center).
     turn = np.cross(np.eye(3), (points - center)[:, None]).swapaxes(-1, -2)
@@ -53,8 +56,9 @@ def causes(chain: SerialChain, places: Sequence[Place]) -> list[Cause]:
     """Return every single change that can happen during a collection.
 
     A sensor is moved; the base (or all sensors on one stand) is moved; one marker slips; the tool
-    with all markers slips; the encoder of a joint slips. With one sensor its motion and that of
-    the base cannot be distinguished, and are one cause.
+    with all markers slips (only with several markers); the encoder of a joint slips. In this
+    order. With one sensor its motion and that of the base cannot be distinguished, and are one
+    cause.
     """
     q = np.array([place.q for place in places])
     markers_T = np.array([place.marker_T for place in places])
@@ -158,8 +162,9 @@ def _exchanged(
 ) -> tuple[list[int], float]:
     """Exchange one reference after the other if another shows rigid motions better.
 
-    Returns the references and their smallest singular value; the exchange ends as soon as that is
-    `wanted`, since the first choice distinguishes the causes best.
+    ``moves``: of each rigid motion the signals of the candidates, (n, 3 S, 6). Returns the
+    references and their smallest singular value; the exchange ends after `MOST_EXCHANGES` rounds,
+    or as soon as that is `wanted`, since the first choice distinguishes the causes best.
     """
     best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
     for _ in range(MOST_EXCHANGES):

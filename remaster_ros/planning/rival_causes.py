@@ -73,7 +73,7 @@ class Rivals:
 
     @property
     def depends_on_approach(self) -> bool:
-        """Whether the two causes differ by the approach direction."""
+        """Whether a driver of either cause depends on the previous configuration."""
         return any(
             name in candidate.driver
             for candidate in (*self.cause, *self.look_alike)
@@ -87,7 +87,11 @@ class Rivals:
         return all(name in names for candidate in self.look_alike for name in candidate.parameters)
 
     def columns(self, context: Context) -> ExtraColumns:
-        """Return the amplitude of the cause and the parameters of the look-alike as columns."""
+        """Return the amplitude of the cause and the parameters of the look-alike as columns.
+
+        Priors: `FREE_STD` of the amplitude; of a parameter the largest plausible size of its
+        effect, or what moves the markers by `LARGEST_M` (RMS).
+        """
         std = []
         for candidate in self.look_alike:
             largest = candidate.largest
@@ -101,14 +105,18 @@ class Rivals:
         )
 
     def _displacement(self, context: Context, nominal: Context) -> FloatArray:
-        """Return the displacement of markers per unit of these columns, m, (n, 3, 1 + m)."""
+        """Return the displacement of markers per unit of these columns, m, (n, 3, 1 + m).
+
+        That in `context`; ``nominal`` is not used.
+        """
         amplitude = _shifts(context, self.cause) @ self.size
         return np.concatenate((amplitude[:, :, None], _shifts(context, self.look_alike)), axis=2)
 
     def imitation(self, information: DesignInformation, measured: Sequence[int]) -> Rivals:
         """Return the reversed pair: the look-alike with the size that imitates the cause best.
 
-        ``information``: with the `columns` of this pair; ``measured``: configurations for the fit.
+        ``information``: with the `columns` of this pair; ``measured``: indices of the
+        configurations that are fitted. This pair is not changed.
         """
         matrix = information.finite(information.total(measured))
         place = information.names.index(AMPLITUDE)
@@ -132,7 +140,11 @@ def rivals_of(
 
 
 def _found_candidates(context: Context, cause: FoundCause) -> tuple[Candidate, ...]:
-    """Return the candidates that have all parameters of a cause between them; () if none."""
+    """Return the candidates that have all parameters of a cause between them; () if none.
+
+    Found largest first, without a parameter twice; a moment is no parameter. The cause's driver,
+    if it has one, must be the candidate's.
+    """
     found: list[Candidate] = []
     missing = {name for name in cause.sizes if name != 'moment'}
     candidates = [
@@ -148,7 +160,10 @@ def _found_candidates(context: Context, cause: FoundCause) -> tuple[Candidate, .
 
 
 def _largest_candidate(context: Context, name: str, joints: tuple[int, ...]) -> Candidate | None:
-    """Return the variant of an effect with the most parameters; None if there is none."""
+    """Return the variant of an effect with the most parameters; None if there is none.
+
+    ``name``: of the effect; ``joints``: as of the candidate, 1-based.
+    """
     candidates = [
         candidate for candidate in _candidates(context, name) if candidate.joints == joints
     ]
@@ -158,7 +173,10 @@ def _largest_candidate(context: Context, name: str, joints: tuple[int, ...]) -> 
 
 
 def _candidates(context: Context, name: str) -> list[Candidate]:
-    """Return all candidates of a named effect that this context has data for."""
+    """Return all candidates of a named effect that this context has data for.
+
+    Those of a moment are left out; [] for an unknown name or ``unnamed``.
+    """
     effect = EFFECTS.get(name)
     if effect is None or name == 'unnamed' or effect.needs(context):
         return []
@@ -177,12 +195,18 @@ def _rms(shift: FloatArray) -> FloatArray:
 
 
 def separation(information: DesignInformation, chosen: Sequence[int]) -> float:
-    """Return the separation of two causes by chosen configurations, in standard deviations."""
+    """Return the separation of two causes by chosen configurations, in standard deviations.
+
+    ``information``: with the columns of `Rivals.columns`; ``chosen``: indices.
+    """
     return 1.0 / float(np.sqrt(variances(information, information.total(chosen)[None])[0]))
 
 
 def variances(information: DesignInformation, matrices: FloatArray) -> FloatArray:
-    """Return the variance of the amplitude for n information matrices (n, f, f), (n,)."""
+    """Return the variance of the amplitude for n information matrices (n, f, f), (n,).
+
+    With the ridge `UNKNOWN`, so that it is finite.
+    """
     place = information.names.index(AMPLITUDE)
     finite = information.finite(matrices)
     unit = np.zeros((len(finite), finite.shape[1], 1))
@@ -192,6 +216,9 @@ def variances(information: DesignInformation, matrices: FloatArray) -> FloatArra
 
 
 def in_words(name: str, joints: Sequence[int]) -> str:
-    """Return a cause as text, such as "backlash of joint 4"."""
+    """Return a cause as text, such as "backlash of joint 4", "backlash of joints 4, 5".
+
+    ``joints``: 1-based; without any, the name alone.
+    """
     at = f' of joint{"s" * (len(joints) > 1)} {", ".join(map(str, joints))}' if joints else ''
     return f'{name.replace("_", " ")}{at}'

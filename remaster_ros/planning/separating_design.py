@@ -92,7 +92,9 @@ class MeasuredSoFar:
 def scene_with_other_elbows(scene: PlanningScene) -> PlanningScene:
     """Return a scene whose poses are also reached with the held joints at other values.
 
-    Other postures of the arm at a pose separate causes that the posture of the plan does not.
+    Those of the cell file plus `ELBOW_STEPS`, within the limits; the same scene if no joint is
+    held. Other postures of the arm at a pose separate causes that the posture of the plan does
+    not.
     """
     chain = scene.model.chain
     margin = scene.limit_margin_rad * chain.per_radian
@@ -111,7 +113,11 @@ def scene_with_other_elbows(scene: PlanningScene) -> PlanningScene:
 
 
 def measured_so_far(rows: Measurements) -> tuple[tuple[PlannedPose, ...], MeasuredSoFar]:
-    """Return the configurations to fit of a session by pose, and their conditions."""
+    """Return the configurations to fit of a session by pose, and their conditions.
+
+    Validation and reference rows are left out, one row for each configuration is kept. T_R_T of
+    the poses is the identity: only their solutions count.
+    """
     not_fitted = rows.is_validation if rows.is_reference is None else rows.is_reference
     to_fit = np.flatnonzero(~(rows.is_validation | not_fitted))
     _, first = np.unique(rows.configuration[to_fit], return_index=True)
@@ -158,7 +164,11 @@ def separate(
 
 
 def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
-    """Return the candidates with fewer solutions of each pose, `MOST_CANDIDATES` in all."""
+    """Return the candidates with fewer solutions of each pose, some `MOST_CANDIDATES` in all.
+
+    Every n-th solution of each, begun at another one from pose to pose; poses without any are left
+    out. Unchanged if there are no more.
+    """
     count = sum(len(pose.solutions) for pose in candidates)
     step = max(1, -(-count // MOST_CANDIDATES))
     # Different solutions of each pose, so that all kinds remain.
@@ -198,7 +208,11 @@ class _Choice:
             self._from_q[self.done] = self.measured.from_q
 
     def context(self) -> Context:
-        """Return the context of effects, for an arm that comes from its last configuration."""
+        """Return the context of effects, for an arm that comes from its last configuration.
+
+        Without `measured` there are no times and moves. New configurations come `BREAK_S` after
+        the last reading, at its temperature.
+        """
         context, measured = nominal_context(*self._model, self._rows), self.measured
         if measured is None:
             return context
@@ -214,7 +228,11 @@ class _Choice:
         return replace(context, measurements=rows, timed=True)
 
     def add(self, first: str, second: str, rivals: Rivals) -> bool:
-        """Add a pair; return False if all candidates together do not separate the two."""
+        """Add a pair; return False, and add nothing, if no candidates separate the two.
+
+        They do not if the separation by all candidates is below `HOPELESS`. ``first, second``:
+        causes as text.
+        """
         information = self._information(rivals)
         both: tuple[Rivals, ...] = rivals, rivals.imitation(information, self.done)
         every = range(len(self.q))
@@ -240,7 +258,10 @@ class _Choice:
         return self._known[rivals]
 
     def design(self, otherwise: tuple[str, ...]) -> SeparatingDesign:
-        """Return the design: chosen configurations, and the separations before and after."""
+        """Return the design: chosen configurations, and the separations before and after.
+
+        ``otherwise``: sentences on pairs that were not added.
+        """
         separations = [self._separation(both, self.done) for _, _, both in self._pairs]
         chosen = self._most_separating()
         added, order = self._as_poses(chosen)
@@ -264,7 +285,11 @@ class _Choice:
         return min(separation(self._information(pair), chosen) for pair in both)
 
     def _most_separating(self) -> list[int]:
-        """Return the most separating configurations, one by one, until all are separated."""
+        """Return the indices of the most separating configurations, one by one.
+
+        Until all pairs are separated by `DECIDED`, or `most` are chosen. Each has the largest sum
+        of log variance ratios of the undecided pairs.
+        """
         chosen: list[int] = []
         remaining = np.arange(len(self.done), len(self.q))
         directions = [pair for _, _, both in self._pairs for pair in both]
@@ -294,7 +319,10 @@ class _Choice:
     def _approach_from(
         self, q: FloatArray, remaining: IntArray, directions: Sequence[Rivals]
     ) -> None:
-        """Set the previous configuration of all remaining ones to q, rad, (k,)."""
+        """Set the previous configuration of all remaining ones to q, rad or m, (k,).
+
+        The information of pairs that depend on it is computed anew. Nothing without `measured`.
+        """
         if self.measured is not None:
             self._from_q[remaining] = q
             for pair in directions:

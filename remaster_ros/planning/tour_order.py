@@ -157,7 +157,7 @@ class Tour:
         return other
 
     def first_poses(self, count: int) -> Tour:
-        """Return a new tour of the first `count` poses of each split."""
+        """Return a new tour of the first `count` poses of each split, none of them visited."""
         plans = {
             split: replace(plan, poses=plan.poses[:count]) for split, plan in self.plans.items()
         }
@@ -181,12 +181,19 @@ class Tour:
         )
 
     def next(self, q: FloatArray) -> PoseVisit | None:
-        """Return the next visit for an arm at joint positions q (rad, (k,)); None at the end."""
+        """Return the next visit for an arm at joint positions q, (k,), and count it as made.
+
+        q: rad or m. None at the end.
+        """
         proposed = self.propose(q)
         return None if proposed is None else self.accept(proposed)
 
     def propose(self, q: FloatArray) -> PoseVisit | None:
-        """Return the visit that `next` would, without counting it; safe in another thread."""
+        """Return the visit that `next` would, without counting it; safe in another thread.
+
+        A round of references, if one is due, comes first. None at the end. Its `solutions` are
+        empty if none has a free path.
+        """
         if self._rounds_due:
             return self._propose_reference(q)
         unvisited = [
@@ -202,7 +209,10 @@ class Tour:
         return self._visit(split, index, route)
 
     def _nearest(self, unvisited: Sequence[tuple[str, int]], q: FloatArray) -> tuple[str, int]:
-        """Return split and index of the next pose of a tour without a given order."""
+        """Return split and index of the next pose of a tour without a given order.
+
+        Nearest by the distance of the tool; the first one if the tour is `in_order`.
+        """
         position = self.chain.forward(q)[:3, 3]
         places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in unvisited]
         distances = np.linalg.norm(np.array(places) - position, axis=1)
@@ -225,7 +235,10 @@ class Tour:
         return len(self._numbers)
 
     def request_reference_round(self) -> None:
-        """Start a round of the references with the next visit."""
+        """Start a round of the references with the next visit; nothing without references.
+
+        A round under way begins anew.
+        """
         if self.references:
             self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
 
@@ -235,9 +248,10 @@ class Tour:
         return self._visit(REFERENCE, index, self._route(REFERENCE, index, [0], q))
 
     def _route_to_reference(self, index: int, q: FloatArray) -> FloatArray | None:
-        """Return waypoints to a reference, rad, (n, k); None if there is no free path.
+        """Return waypoints to a reference, rad or m, (n, k); None if there is no free path.
 
-        The path goes by way of the previous reference, or directly if that cannot be reached.
+        The path goes by way of the previous reference (of the first one the last), or directly if
+        that cannot be reached.
         """
         goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
         goal, previous = goals[index], goals[index - 1]
@@ -255,7 +269,10 @@ class Tour:
         return free_waypoints(self._model, q, goal, self.chain.velocity_limits, index)
 
     def accept(self, proposed: PoseVisit) -> PoseVisit:
-        """Count a proposed visit as made, and return it with its number."""
+        """Count a proposed visit as made, and return it with its number.
+
+        It must be of the present state of the tour.
+        """
         p = proposed
         return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached)
 
@@ -270,7 +287,7 @@ class Tour:
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
     ) -> PoseVisit:
-        """Return a visit to the same pose with another route (see `Route`)."""
+        """Return a visit to the same pose with another route (see `Route`); nothing is counted."""
         other = self._visit(visit.split, visit.index, Route(ids, paths, unreached))
         return replace(other, pose=visit.pose)
 
@@ -284,7 +301,9 @@ class Tour:
     ) -> PoseVisit:
         """Count a visit to a planned pose as made, and return it; `Route` has the arguments.
 
-        A tour is resumed by calling this for all visits made so far, in their order.
+        Of a tour without an order all solutions of the pose are done then, else those of the
+        route. A tour is resumed by calling this for all visits made so far, in their order. Raises
+        KeyError for a pose that is done already.
         """
         visit = self._visit(split, index, Route(ids, paths, unreached))
         if split == REFERENCE:
@@ -302,7 +321,10 @@ class Tour:
         return visit
 
     def drop_remaining(self, split: str, reason: str) -> None:
-        """Drop the remaining visits of a split, with the reason."""
+        """Drop the remaining visits of a split; they are counted with the reason.
+
+        A pose that was begun counts as visited. Raises KeyError for a split that is not planned.
+        """
         unvisited, self._unvisited[split] = self._unvisited[split], {}
         for index, numbers in unvisited.items():
             self.dropped_solutions[reason] += len(numbers)
@@ -325,7 +347,11 @@ class Tour:
             self._rounds_due -= 1
 
     def _visit(self, split: str, index: int, route: Route) -> PoseVisit:
-        """Return the visit to a planned pose along a route."""
+        """Return the visit to a planned pose along a route; nothing is counted.
+
+        Its number is that of an earlier visit to the pose, else the next one; negative for a
+        registration.
+        """
         pose = self.plans[split].poses[index]
         number = self.begin_at + self.visited if split != REGISTRATION else -1 - self.visited
         number = self._numbers.get((split, index), number)
@@ -336,7 +362,11 @@ class Tour:
         )
 
     def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
-        """Return the route to solutions of a pose, in the order of `free_order`."""
+        """Return the route to solutions of a pose, in the order of `free_order`.
+
+        ``ids``: indices into the pose's solutions; those without a path are in `unreached`. The
+        same arguments give the same route.
+        """
         ids = list(ids)
         if split == REFERENCE:
             waypoints = self._route_to_reference(index, q) if ids else None
@@ -373,8 +403,9 @@ def nearest_solution(
 ) -> int | None:
     """Return the index of the solution (m, k) at which the arm stands; None if there is none.
 
-    All joints must agree within the tolerance, rad. It is ten times what the bridge accepts as
-    arrived by default, and far below the difference between two solutions of a pose.
+    All joints must agree within the tolerance, rad (of a slide as `units` count it), without whole
+    turns; of several the nearest. It is ten times what the bridge accepts as arrived by default,
+    and far below the difference between two solutions of a pose. Raises ValueError if m is 0.
     """
     distance = np.max(np.abs(solutions - q) / units.per_radian, axis=1)
     nearest = int(np.argmin(distance))

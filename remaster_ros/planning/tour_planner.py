@@ -178,7 +178,9 @@ class TourPlanner:
     def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
         """Return the tour of poses to fit and to validate, for sensors with these registrations.
 
-        ``T_R_N``: (4, 4) each. Raises InsufficientDataError if no pose is left to fit.
+        ``T_R_N``: (4, 4) each. Sets `design_result` and `separating_design`. Raises
+        InsufficientDataError if no pose is left to fit; with an optimal design also as
+        `designed_plans`.
         """
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
         plans = {
@@ -206,7 +208,10 @@ class TourPlanner:
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
 
     def _separating(self, plan: Plan, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        """Return a plan with configurations added that separate the causes."""
+        """Return a plan with configurations added that separate the causes.
+
+        Sets `separating_design`.
+        """
         rng = np.random.default_rng([self._seed, *b'separate'])
         pool = scene_with_other_elbows(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
         self.separating_design = separate(
@@ -232,7 +237,8 @@ class TourPlanner:
 
         ``T_R_N``: registrations of the sensors, (4, 4); ``causes``: with their look-alikes;
         ``rows``: the session's measurements; ``previous``: its last tour, whose references are
-        visited again; ``most``: largest number of configurations.
+        visited again, and whose numbers go on; ``most``: largest number of configurations. Without
+        poses if none separate the causes. Sets `separating_design`.
         """
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
         rng = np.random.default_rng(
@@ -307,7 +313,10 @@ class TourPlanner:
         return Tour(self._chain, plans, in_order=True, model=self.model)
 
     def _reachable(self, poses: list[PlannedPose]) -> list[PlannedPose]:
-        """Return `VERIFIED_POSES` of the poses in an order with a path from each to the next."""
+        """Return `VERIFIED_POSES` of the poses in an order with a path from each to the next.
+
+        Fewer if not enough can be reached.
+        """
         while True:
             q = np.array([pose.solutions[0] for pose in poses[:VERIFIED_POSES]])
             chosen = [poses[i] for i in self._nearest_order(q, list(range(len(q))))]
@@ -317,7 +326,10 @@ class TourPlanner:
             poses = [pose for pose in poses if all(pose is not each for each in unreachable)]
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
-        """Return references among planned configurations, with a path from each to the next."""
+        """Return references among planned configurations, with a path from each to the next.
+
+        After `MOST_TRIES` choices as they are, with or without paths.
+        """
         poses = [
             PlannedPose(pose.T_R_T, q[None])
             for plan in plans.values()
@@ -337,7 +349,10 @@ class TourPlanner:
         return Plan(tuple(chosen))
 
     def _nearest_order(self, q: FloatArray, indices: list[int]) -> list[int]:
-        """Return indices into q (n, k) in nearest-neighbour order."""
+        """Return indices into q (n, k) in nearest-neighbour order, from the first one on.
+
+        Nearest by travel time, see `order_solutions`; [] for no indices.
+        """
         order = indices[:1]
         while remaining := [i for i in indices if i not in order]:
             limits = self._chain.velocity_limits
@@ -345,7 +360,7 @@ class TourPlanner:
         return order
 
     def _unreachable(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
-        """Return the poses without a free path from the one before."""
+        """Return the poses without a free path from the one before, to the first from the last."""
         limits = self._chain.velocity_limits
         return [
             pose
@@ -355,7 +370,7 @@ class TourPlanner:
         ]
 
     def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        """Return the plan of a split from its candidates."""
+        """Return the plan of a split from its candidates, always the same for the same sensors."""
         # Seeded by the split: the plan does not depend on what was planned before a restart.
         rng = np.random.default_rng([self._seed, *split.encode()])
         return self.scene.plan(self._counts[split], sensors_R, rng)

@@ -74,7 +74,8 @@ class TravelTime:
     def straight(self, start: FloatArray, ends: FloatArray) -> FloatArray:
         """Return the times of the straight lines from one configuration to n others, s, (n,).
 
-        ``start``: rad, (k,); ``ends``: rad, (n, k).
+        ``start``: rad or m, (k,); ``ends``: rad or m, (n, k). From rest to rest, at least 2
+        `RAMP_S`, also for no way at all; without settling and dwell.
         """
         way = ends - start
         size = np.maximum(np.abs(way), 1e-12)
@@ -89,7 +90,10 @@ class TravelTime:
         return 1.0 / np.minimum(HEADROOM * rate, 1.0 / RAMP_S) + RAMP_S
 
     def between(self, q: FloatArray) -> FloatArray:
-        """Return the times of the straight lines between configurations q (n, k), s, (n, n)."""
+        """Return the times of the straight lines between configurations q (n, k), s, (n, n).
+
+        Symmetric but for rounding; the diagonal is not 0, see `straight`.
+        """
         return np.array([self.straight(start, q) for start in q])
 
     def along(self, points: FloatArray) -> float:
@@ -97,7 +101,10 @@ class TravelTime:
         return self.trajectory(points)[0].duration_s
 
     def trajectory(self, points: FloatArray) -> tuple[Trajectory, float]:
-        """Return the trajectory along a polyline (n + 1, k), and the tool's largest speed, m/s."""
+        """Return the trajectory along a polyline (n + 1, k), and its largest point speed, m/s.
+
+        The speed is of the fastest point of arm and tool, also if no such limit is kept. n >= 1.
+        """
         peaks = self.speeds.peaks_m(points)
         limited = peaks if np.isfinite(self.limits.tool_speed) else ()
         trajectory = plan_trajectory(self.limits, points, limited)

@@ -47,7 +47,7 @@ def fastest_order(times: FloatArray) -> list[int]:
 
 
 def _nearest(times: FloatArray) -> list[int]:
-    """Return the nearest-neighbour order of all places."""
+    """Return the nearest-neighbour order of all places, from place 0 on."""
     order, unvisited = [0], np.ones(len(times), bool)
     unvisited[0] = False
     while unvisited.any():
@@ -57,7 +57,10 @@ def _nearest(times: FloatArray) -> list[int]:
 
 
 def _reverse(times: FloatArray, order: list[int]) -> bool:
-    """Reverse the part of the order that gains most, ends excepted; return whether any gains."""
+    """Reverse the part of the order that gains most, ends excepted; return whether any gains.
+
+    ``order``: changed in place; a gain counts from 1e-9 s on.
+    """
     at = np.array(order)
     # Times of the part from i to j: entry from i - 1, exit to j + 1.
     entry, exit_ = times[at[:-2], at[1:-1]], times[at[1:-1], at[2:]]
@@ -73,7 +76,11 @@ def _reverse(times: FloatArray, order: list[int]) -> bool:
 
 
 def _move(times: FloatArray, order: list[int]) -> bool:
-    """Move the part of the order that gains most; return whether any move gains."""
+    """Move the part of the order that gains most; return whether any move gains.
+
+    Up to `LONGEST_MOVED` places, also reversed; ends stay. ``order``: changed in place; a gain
+    counts from 1e-9 s on.
+    """
     best, move = 1e-9, None
     for size in range(1, LONGEST_MOVED + 1):
         for i in range(1, len(order) - size):
