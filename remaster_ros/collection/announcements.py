@@ -47,8 +47,9 @@ class Announcements:
     def matched(self, subscribers: int, now: float) -> bool:
         """Whether bridge and recorder are ready for the next pose.
 
-        Not if the recorder's session is complete, until it has reopened it. ``subscribers``:
-        number of subscribers of the solutions by DDS; ``now``: wall time, s.
+        They are once both have reported and subscribed for `MATCH_WALL_S`; not while the
+        recorder's session is complete, until it has reopened it. ``subscribers``: number of
+        subscribers of the solutions by DDS; ``now``: wall time, s.
         """
         recorder = self._peers.recorder
         if subscribers < len(PEERS) or self._peers.bridge is None or recorder is None:
@@ -61,7 +62,11 @@ class Announcements:
         return now - self._matched_wall > MATCH_WALL_S
 
     def announced(self, stamp: str, now: float) -> None:
-        """Note an announcement; with an unchanged stamp the next wait doubles."""
+        """Note an announcement at `now`, wall time, s; it counts as missed after a wait.
+
+        The wait is `ANNOUNCE_WALL_S`; with an unchanged stamp twice the last one, up to
+        `LONGEST_WALL_S`.
+        """
         is_repeated = stamp == self.stamp
         self._wait_wall = (
             min(2.0 * self._wait_wall, LONGEST_WALL_S) if is_repeated else ANNOUNCE_WALL_S

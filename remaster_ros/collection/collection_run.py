@@ -38,9 +38,10 @@ class CollectionRun:
         self.state, self.why, self.token, self.left = 'idle', '', '', ''
 
     def resume(self, state: str, token: str, progress: str) -> None:
-        """Restore the state of a planner before this one.
+        """Restore the state of a planner before this one; of a running run, its token in `left`.
 
-        ``state``, ``token``: as last written; ``progress``: of the collection, as text.
+        ``state``, ``token``: as last written; ``progress``: of the collection, as text. The state
+        is ``complete`` or else ``idle``, with `why`.
         """
         if state == 'complete':
             self.state = state
@@ -56,6 +57,10 @@ class CollectionRun:
         progress: str,
     ) -> bool:
         """Resume the run of a killed planner if it still lives; return whether that is decided.
+
+        It lives if the planner was silent for at most `resume_within_s`, bridge and recorder hold
+        its token, and neither a halt nor a changed setup asks for a person. Not decided before the
+        first states of both. Else `why` has the reason, and `left` is ''.
 
         ``silence_s``: time since that planner renewed its liveness file, s; None if it did not in
         this boot of the computer, or has ended the run; ``bridge, recorder``: last states, None
@@ -134,7 +139,10 @@ class CollectionRun:
         self.end('stopped')
 
     def end(self, state: str, why: str = '', *, only_from: str = '') -> bool:
-        """End the run in a state; return False if its state is not `only_from`."""
+        """End the run in a state; return False, and change nothing, if it is not `only_from`.
+
+        ``why``: for people; ``only_from``: '' for any state.
+        """
         if only_from and self.state != only_from:
             return False
         self.state, self.why, self.token = state, why, ''

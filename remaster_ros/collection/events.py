@@ -348,7 +348,7 @@ class _Version(msgspec.Struct):
 
 
 def encode(record: EventRecord) -> str:
-    """Record as JSON."""
+    """Record as JSON text, for std_msgs/String; NumPy scalars are converted."""
     return _ENCODER.encode(record).decode()
 
 

@@ -68,7 +68,12 @@ class FirstRegistration:
         self.troubles: dict[str, str] = {}
 
     def add(self, readings: Iterable[PairedReading]) -> list[str]:
-        """Add readings at registration poses; names of sensors registered (again) by them."""
+        """Add readings at registration poses; names of sensors registered (again) by them.
+
+        A sensor is registered with `POINTS` configurations or more; if its points give no
+        registration, `troubles` says why, and it keeps an earlier one. Raises KeyError for an
+        unknown sensor.
+        """
         registered: list[str] = []
         taken: dict[str, None] = {}
         for reading in readings:
@@ -95,7 +100,12 @@ class FirstRegistration:
         return registered
 
     def _frame(self, options: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
-        """T_R_N by the choice of markers that agrees best; raises `InsufficientDataError`."""
+        """T_R_N by the choice of markers that agrees best: most points, then least RMS.
+
+        ``options``: places that each point may have, (m, 3) each; ``measured``: (n, 3), m. Raises
+        InsufficientDataError if no choice gives a registration, or another one agrees as well
+        (`CLEARLY_WORSE`).
+        """
         failure: InsufficientDataError | None = None
         found = []
         for choice in itertools.product(*options):
@@ -126,6 +136,6 @@ class FirstRegistration:
         return T_R_N
 
     def describe(self) -> str:
-        """Progress of the registration, as text."""
+        """Progress of the registration, as text: points of each sensor, then troubles."""
         parts = [f'{name}: point {len(stops)} of {POINTS}' for name, stops in self._stops.items()]
         return '; '.join([*parts, *self.troubles.values()])

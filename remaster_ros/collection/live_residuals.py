@@ -59,12 +59,19 @@ class LiveResiduals:
             total[:] = 0.0
 
     def reading(self, sensor: str, marker: str, position_N: FloatArray) -> None:
-        """Add a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden."""
+        """Add a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden.
+
+        Nothing if it is not finite, or no configuration is open. Raises KeyError for an unknown
+        marker.
+        """
         if self._q is not None and np.all(np.isfinite(position_N)):
             self._sums[sensor, marker] += [*position_N, 1.0]
 
     def ended(self, *, recorded: bool, registering: bool = False) -> None:
-        """End a configuration, of the registration or not; it counts if it was recorded."""
+        """End the open configuration; its mean readings count if it was recorded.
+
+        ``registering``: whether it is of the registration. Nothing if none is open.
+        """
         if self._q is not None and recorded:
             for (name, marker), total in self._sums.items():
                 if total[3]:
@@ -82,7 +89,7 @@ class LiveResiduals:
         self._found.clear()
 
     def use_markers(self, markers: Mapping[str, FloatArray]) -> None:
-        """Use these fitted markers from now on, marker -> m, (3,)."""
+        """Use these fitted markers from now on, marker -> m, (3,); other names are ignored."""
         for places in self._markers.values():
             places.update({name: markers[name] for name in places if name in markers})
         self._found.clear()
@@ -93,7 +100,7 @@ class LiveResiduals:
         return self._offsets is not None
 
     def norms_m(self, sensor: str) -> FloatArray:
-        """Length of each residual, m, (n,); n = 0 for too few."""
+        """Length of each residual, m, (n,), in order; n = 0 with fewer than `FEWEST` points."""
         return self._fitted(sensor)[0]
 
     def of_registration(self, sensor: str) -> int:
@@ -101,7 +108,7 @@ class LiveResiduals:
         return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:
-        """Measured points in the robot base, m, (n, 3); n = 0 for too few."""
+        """Measured points in the robot base, m, (n, 3); n = 0 with fewer than `FEWEST`."""
         return self._fitted(sensor)[1]
 
     def _fitted(self, sensor: str) -> tuple[FloatArray, FloatArray]:

@@ -18,7 +18,7 @@ def seconds(stamp: Any) -> float:
 
 
 def stamp_key(stamp: Any) -> str:
-    """Stamp as exact text, the name of a pose in events."""
+    """Stamp as exact text, SEC.NANOSEC with nine digits: the name of a pose in events."""
     return f'{stamp.sec}.{stamp.nanosec:09d}'
 
 
@@ -46,9 +46,10 @@ class JointOrder:
         return names == self._seen or not set(self.names).isdisjoint(names)
 
     def positions(self, message: Any) -> FloatArray:
-        """Positions in the wanted order, rad, (k,).
+        """Positions in the wanted order, rad or m, (k,); further joints are left out.
 
-        Raises InputError, with its name, if a joint is missing or named more than once.
+        Raises InputError, with its name, if a joint is missing or named more than once, or if
+        there are not as many positions as names. NaN is returned as it is.
         """
         names = tuple(message.name)
         if names != self._seen:
@@ -83,7 +84,10 @@ def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
 
 
 def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> None:
-    """Raises InputError, with the names, if a message names a wanted joint twice."""
+    """Raise InputError, with the names, if a message names a wanted joint twice.
+
+    ``wanted, given``: names of joints; ``topic``: for the message.
+    """
     repeated = [name for name in wanted if list(given).count(name) > 1]
     if repeated:
         raise InputError(

@@ -26,8 +26,9 @@ class Pace:
     def update(self, done: int, now_s: float, *, running: bool) -> None:
         """Record the progress of the collection.
 
-        ``done``: number of configurations with an outcome; ``now_s``: time of a monotonic clock,
-        s; ``running``: whether the arm may move.
+        ``done``: number of configurations with an outcome; fewer than before begin anew;
+        ``now_s``: time of a monotonic clock, s; ``running``: whether the arm may move: other time
+        does not count.
         """
         if self._last_s is not None and running:
             self._running_s += max(now_s - self._last_s, 0.0)
@@ -42,7 +43,10 @@ class Pace:
             self._done, self._since_s = done, self._running_s
 
     def left_s(self, left: int) -> float | None:
-        """Time of ``left`` more configurations, s; None before enough are finished."""
+        """Time of ``left`` more configurations, s; None before `FEWEST` are finished.
+
+        At the mean pace of the last `KEPT`; 0 if none is left.
+        """
         if left <= 0:
             return 0.0
         if len(self._durations_s) < FEWEST:
@@ -66,7 +70,7 @@ def progress_text(counts: Mapping[str, Any], left_s: float | None) -> str:
 
 
 def minutes_text(left_s: float | None) -> str:
-    """Remaining time in words; '' if unknown."""
+    """Remaining time in words: tens of seconds up to 90 s, then minutes; '' if unknown."""
     if left_s is None:
         return ''
     if left_s < 90.0:

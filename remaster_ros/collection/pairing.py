@@ -55,7 +55,10 @@ def of_the_marker(positions: FloatArray) -> NDArray[np.bool_]:
 
 
 def are_too_many(dropped: int, frames: int) -> bool:
-    """Whether so many frames are dropped that the remaining ones are in doubt."""
+    """Whether so many frames are dropped that the remaining ones are in doubt.
+
+    More than one and more than a share of `MOST_DROPPED`. ``frames``: dropped ones included.
+    """
     return dropped > max(1.0, MOST_DROPPED * frames)
 
 
@@ -109,7 +112,7 @@ class PairedReading:
     def inverted(self) -> PairedReading:
         """Reading with the inverse pose: of the sensor in its target, or the reverse.
 
-        `std` stays.
+        `std` stays. It must have an orientation.
         """
         assert self.orientation is not None
         position, turn = inverse_poses(self.position, self.orientation)
@@ -196,7 +199,11 @@ class Pairing:
         self._readings: dict[str, list[MarkerReading]] = {name: [] for name in self.rules}
 
     def add_joint_state(self, stamp_s: float, q: FloatArray) -> None:
-        """Add a report of the joint positions, rad, (k,), in the order of arrival."""
+        """Add a report of the joint positions, rad or m, (k,), in the order of arrival.
+
+        A stamp that goes back by more than `CLOCK_BACK_S` rejects all undecided sensors
+        (``clock``); another one that does not advance is ignored.
+        """
         if self._joints and stamp_s < self._now_s - CLOCK_BACK_S:
             detail = f'the clock of joint_states went back by {self._now_s - stamp_s:.1f} s'
             self._reject_undecided('clock', detail)
@@ -212,7 +219,10 @@ class Pairing:
             self._decide()
 
     def fail(self, sensor: str, detail: str) -> None:
-        """Record that the device itself reported that there is no measurement."""
+        """Reject a sensor (``device``), whose device reported that there is no measurement.
+
+        An earlier decision stays.
+        """
         self._set(Rejection(sensor, 'device', detail))
 
     def give_up(
@@ -287,16 +297,19 @@ class Pairing:
         self._message_counts = dict(counts)
 
     def has_reading(self, sensor: str) -> bool:
-        """Whether any reading of a sensor has arrived."""
+        """Whether any reading of a sensor has arrived, NaN included; KeyError if it is unknown."""
         return bool(self._readings[sensor])
 
     def is_required(self, sensor: str) -> bool:
-        """Whether the arm waits for this sensor."""
+        """Whether the arm waits for this sensor, or for any; `require` decides."""
         return self.require in ('all', 'any', sensor)
 
     @property
     def complete(self) -> bool:
-        """Whether all sensors are decided, or those that the arm waits for."""
+        """Whether all sensors are decided, or those that the arm waits for.
+
+        With ``any``: once one of them has a reading.
+        """
         if len(self.decided) == len(self.rules):
             return True
         if self.require == 'any':
@@ -308,7 +321,10 @@ class Pairing:
         self._reject_undecided('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
-        """Waiting time of the arm for each sensor, s: from one decision to the next."""
+        """Waiting time of the arm for each sensor, s: from one decision to the next.
+
+        The first from the settling; 0 for a sensor that is not decided.
+        """
         waited, since = dict.fromkeys(self.rules, 0.0), self.settled_stamp_s
         for name, at in sorted(self._decided_s.items(), key=lambda item: item[1]):
             waited[name], since = at - since, at
@@ -321,6 +337,7 @@ class Pairing:
             self._decided_s[item.sensor] = self._now_s
 
     def _reject_undecided(self, reason: str, detail: str) -> None:
+        """Reject all sensors without a decision."""
         for name in self.rules:
             self._set(Rejection(name, reason, detail))
 
@@ -365,7 +382,7 @@ class Pairing:
         ]
 
     def _by_marker(self, rules: SensorRules) -> dict[str, list[MarkerReading]]:
-        """Readings of each of a sensor's markers."""
+        """Readings of each of a sensor's markers, by name; [] for one without readings."""
         readings = self._readings[rules.sensor]
         if not rules.further:
             return {rules.marker: readings}
@@ -425,7 +442,9 @@ class Pairing:
     ) -> PairedReading | Rejection:
         """Paired mean of a marker's used readings until `end`, s, or a Rejection.
 
-        The arm moved or was unseen, or the readings are scattered, unsteady or frozen.
+        In this order: ``moving`` (`motion_tolerance`), ``unseen`` (`LONGEST_GAP_S`), and of a
+        stream ``scattered`` (`of_the_marker`), ``unsteady`` (`max_std_m`) and ``frozen`` (all the
+        same).
         """
         if rules.single_shot:
             end = used[0].stamp_s
@@ -478,5 +497,5 @@ class Pairing:
 
 
 def _seen(readings: list[MarkerReading]) -> list[MarkerReading]:
-    """Readings with a visible marker."""
+    """Readings with a visible marker, in order."""
     return [reading for reading in readings if reading.seen]

@@ -53,7 +53,10 @@ class PeerModels:
             self._peers[record.node] = now, f'{why} with the same version of remaster_ros'
 
     def trouble(self, now: float) -> str:
-        """Sentence on a node that computes with another arm; ''."""
+        """Sentence on a node that computes with another arm; '' if none does.
+
+        Nodes that were silent for more than `SILENT_S` do not count. ``now``: wall time, s.
+        """
         troubles = (text for seen, text in self._peers.values() if now - seen <= SILENT_S)
         return next(filter(None, troubles), '')
 
@@ -108,10 +111,7 @@ class RequiredSensors:
 
 
 class LastState(NamedTuple):
-    """Last state of a node, with its wall time of arrival, s.
-
-    Last result: the start of the node that sent it.
-    """
+    """Last state of a node, its wall time of arrival, s, and the start of that node."""
 
     body: BridgeState | RecorderState
     wall: float
@@ -131,7 +131,10 @@ class Peers:
         self._reports: dict[str, tuple[SensorReport, float]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Process a record of a node; only these states count."""
+        """Keep a state of bridge, recorder or a sensor; other records are ignored.
+
+        ``now``: wall time of its arrival, s.
+        """
         match record.body:
             case BridgeState() | RecorderState() as body:
                 self._heard[body.sender] = LastState(body, now, record.started)
@@ -181,8 +184,8 @@ class Peers:
     def _sensor_facts(self, name: str, now: float, seen_before: bool) -> SensorFacts:
         """Facts on a sensor: age of node and reading, s, whether it is ready, and its message.
 
-        A sensor without a report is not ready; the age of its reading is 0 if it was
-        `seen_before`.
+        A sensor without a report is not ready, and its node infinitely old. The age of the reading
+        is 0 for every sensor if `seen_before`, infinite if there was none.
         """
         nothing = SensorReport(sensor=name, ready=False), -NEVER_S
         report, came = self._reports.get(name, nothing)
@@ -197,9 +200,11 @@ class Peers:
         )
 
     def _since_s(self, node: str, now: float) -> float:
+        """Wall time since a node's last state, s; infinite before the first."""
         heard = self._heard.get(node)
         return NEVER_S if heard is None else now - heard.wall
 
 
 def _age_s(age_s: float | None) -> float:
+    """Age, s; infinite for None."""
     return NEVER_S if age_s is None else age_s

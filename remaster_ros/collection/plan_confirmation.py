@@ -18,7 +18,10 @@ CONFIRM, COLLECT = '/remaster/confirm', '/remaster/collect'
 
 
 def fingerprint(tour: Tour) -> str:
-    """Return a short checksum of the poses, solutions and order of a tour."""
+    """Return a checksum of the poses, solutions and order of a tour, 8 hexadecimal digits.
+
+    It does not change while the tour is visited.
+    """
     digest = hashlib.sha256(repr((tour.order, tour.reference_every)).encode())
     for split, plan in sorted(tour.plans.items()):
         digest.update(f'{split} {len(plan.poses)} '.encode())
@@ -62,7 +65,7 @@ class PlanConfirmation:
         self._pending: set[str] = set()
 
     def withdraw(self) -> None:
-        """Mark the page as outdated: another plan is next."""
+        """Mark the page as outdated, as another plan is next; a confirmation stays."""
         self.shown = self.trouble = ''
 
     def show(self, plan: str) -> None:
@@ -72,7 +75,10 @@ class PlanConfirmation:
             self._pending.add(plan)
 
     def allows(self, tour: Tour | None) -> bool:
-        """Whether the arm may follow a tour."""
+        """Whether the arm may follow a tour: its plan is confirmed, or that is not required.
+
+        False for None if it is required.
+        """
         if not self.required:
             return True
         return tour is not None and self.confirmed == fingerprint(tour)

@@ -99,9 +99,11 @@ class Plausibility:
     ) -> PairedReading | Rejection:
         """The reading, or the reason why it is not plausible.
 
-        ``T_R_N``: sensor in the robot base, (4, 4), None before it is registered; ``anywhere``: at
-        a reference, where a deviation shows a change, any deviation up to `max_deviation_m` is
-        plausible.
+        ``frozen``: the same to the last bit as the one before, though the arm moved (`MOVED_M`,
+        `TURNED_RAD`); ``swapped``: further from the model than allowed. Plausible readings are
+        kept to judge later ones. ``T_R_N``: sensor in the robot base, (4, 4), None before it is
+        registered, when only ``frozen`` is judged; ``anywhere``: at a reference, where a deviation
+        shows a change, any deviation up to `max_deviation_m` is plausible.
         """
         name = reading.sensor
         marker_R = self._place(reading)
@@ -134,7 +136,11 @@ class Plausibility:
         return self._chain.positions(reading.q, np.asarray(self._markers[reading.marker], float))
 
     def _allowed_m(self, sensor: str) -> float:
-        """Largest plausible deviation of a sensor's reading, m, by its usual ones if known."""
+        """Largest plausible deviation of a sensor's reading, m.
+
+        `UNUSUAL` times the median of its deviations so far, between `SMALLEST_M` and
+        `max_deviation_m`; the latter before `LEARNING` of them.
+        """
         usual = self._usual.get(sensor, ())
         if len(usual) < LEARNING:
             return self._max_deviation_m

@@ -79,7 +79,10 @@ class EndedReading:
 
     @property
     def result(self) -> Outcome:
-        """Outcome: ``partial`` if a sensor that was waited for has no reading."""
+        """Outcome: ``rejected`` without any reading, ``partial`` if some are missing.
+
+        Missing is a sensor that was waited for and not absent; else ``recorded``.
+        """
         if not self.accepted:
             return 'rejected'
         missed = any(item.reason not in ('not_waited', 'absent') for item in self.rejected)
@@ -175,7 +178,10 @@ class Recording:
         self._solutions = solutions if len(solutions) else None
 
     def take_joints(self, stamp_s: float, q: FloatArray) -> None:
-        """Process joint states, rad, (k,)."""
+        """Process joint states: stamp, s, and positions, rad or m, (k,).
+
+        A stamp that goes back by more than `SET_BACK_S` clears what is stored.
+        """
         if stamp_s < self.now_s - SET_BACK_S:
             # The robot's clock was set back: stored messages are later than all new ones.
             self._joints.clear()
@@ -186,13 +192,13 @@ class Recording:
             self.pairing.add_joint_state(stamp_s, q)
 
     def take_reading(self, sensor: str, reading: MarkerReading) -> None:
-        """Process a reading of a sensor."""
+        """Process a reading of a sensor: it is stored, and added to the reading under way."""
         self._readings.append((sensor, reading))
         if self.pairing is not None:
             self.pairing.add_reading(sensor, reading)
 
     def take_temperature(self, stamp_s: float, temperature_c: float) -> None:
-        """Process a temperature, degrees Celsius."""
+        """Store a temperature, °C, with its stamp, s, for later configurations."""
         self._temperatures.append((stamp_s, temperature_c))
 
     def take_settled(
@@ -212,7 +218,10 @@ class Recording:
         return False
 
     def take_stop(self) -> None:
-        """Process that the arm was stopped during a motion: its next start is not known."""
+        """Note that the arm was stopped during a motion: where its next one starts is unknown.
+
+        The `from_q` of the next reading is None; a reading under way is not changed.
+        """
         self._from_q = None
 
     # What is known
@@ -253,11 +262,14 @@ class Recording:
             self._unknown = None
 
     def next(self) -> SettledArm | None:
-        """Configuration that is to be read now, once; None if there is none."""
+        """Configuration that is to be read now, once; None if there is none.
+
+        None also while a reading is in progress.
+        """
         return self._due.popleft() if self._due and self.pairing is None else None
 
     def begin(self, settled: SettledArm) -> None:
-        """Begin to read a configuration, with the earlier messages as well."""
+        """Begin to read a configuration, with the messages stored so far as well."""
         self.pairing, self._settled = self._new_pairing(settled), settled
         # Set now and not after the reading, as a stop may come in between.
         self._previous_q, self._from_q = self._from_q, settled.q
@@ -284,7 +296,11 @@ class Recording:
         return pairing
 
     def give_up(self, absent: Collection[str], words: Mapping[str, int]) -> None:
-        """Reject sensors that are late; see `Pairing.give_up`."""
+        """Reject sensors that are late in the reading under way; see `Pairing.give_up`.
+
+        ``absent``: names of absent sensors; ``words``: number of messages of each sensor's node.
+        Nothing without a reading.
+        """
         if self.pairing is not None:
             self.pairing.give_up(self.now_s, absent, words)
 
@@ -307,9 +323,9 @@ class Recording:
             self.pairing.end_as_recorded(result, reason)
 
     def end(self, T_R_N: Mapping[str, FloatArray]) -> EndedReading | None:
-        """Outcome of the configuration once it is decided; None before.
+        """Outcome of the configuration once it is decided; None before, and without a reading.
 
-        ``T_R_N``: registrations so far, sensor -> (4, 4).
+        The reading is over then. ``T_R_N``: registrations so far, sensor -> (4, 4).
         """
         pairing, settled = self.pairing, self._settled
         if pairing is None or settled is None or not pairing.complete:
@@ -374,9 +390,9 @@ class Recording:
 
     @property
     def unseen(self) -> str:
-        """Markers that were not visible for long while others of their sensor were, as text.
+        """Markers without a reading for `UNSEEN` configurations or more, as text; ''.
 
-        ''.
+        Only configurations count at which the same sensor measured others.
         """
         return '; '.join(
             f'{marker} of {sensor} was not seen at the last {count} configurations, and is left '
@@ -386,7 +402,7 @@ class Recording:
         )
 
     def _temperature_c(self, stamp_s: float) -> float | None:
-        """Last temperature before a time, if that is not long ago.
+        """Last temperature before a time, °C; None if it is older than `TEMPERATURE_S`.
 
         The temperature of the reading itself is not used: it is on a separate topic and may come
         after the point, and a replay must write the same as the recording.

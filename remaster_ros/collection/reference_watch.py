@@ -31,7 +31,8 @@ def changes(
 ) -> tuple[int, list[SetupChange]]:
     """Number of rounds of the references, and the changes that they show.
 
-    Each change is returned once, as found by the last round that shows it.
+    Each change is returned once, as found by the last round that shows it; 0 and [] without
+    references. ``T_R_N``: registrations, sensor -> (4, 4).
     """
     m = session.references
     if m is None:
@@ -221,7 +222,7 @@ class ReferenceWatch:
         return len(self._references) if known is None else known, reading.sensor
 
     def end_round(self) -> None:
-        """End the round: the arm goes elsewhere before the next reading."""
+        """End the round, as the arm goes elsewhere: the next reading begins another one."""
         self._open = False
 
     def accept(self) -> None:
@@ -266,11 +267,12 @@ class ReferenceWatch:
     # Noise
 
     def _noise(self, sensor: str, off: Displacements) -> Noise | None:
-        """Noise of a sensor; None if it is not known yet.
+        """Noise of a sensor: std per axis, m, and degrees of freedom; None if unknown yet.
 
         By the differences of successive rounds without an alarm: of the first two, and of later
-        ones as they come. A slow drift hardly changes these, so that it is not taken for noise. At
-        least the standard error of a mean over a dwell by its own scatter.
+        ones as they come; unknown with fewer than `FEWEST_FREEDOMS`. A slow drift hardly changes
+        these, so that it is not taken for noise. At least the standard error of a mean over a
+        dwell by its own scatter, and `LEAST_STD_M`.
         """
         quiet = [r.judged and not r.alarmed for r in self._rounds]
         steps = [
@@ -296,7 +298,11 @@ class ReferenceWatch:
         return float(np.sqrt(variance)), first + int((differences.size - first) * 2 / 3)
 
     def _unsteady(self, noise: Mapping[str, Noise]) -> SetupChange | None:
-        """Change ``unsteady`` if the first two rounds differ too much to show later changes."""
+        """Change ``unsteady`` if the first two rounds differ too much to show later changes.
+
+        They do if the largest noise of a sensor times sqrt(6) (three axes, two rounds) is `stop_m`
+        or more. Sets `change`; None if not, or without a noise.
+        """
         if not noise:
             return None
         sensor, (std, _) = max(noise.items(), key=lambda item: item[1][0])
@@ -320,6 +326,7 @@ class ReferenceWatch:
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 
     def _place(self, row: ReferenceReading) -> Place:
+        """Marker and sensor of a reading as a `Place`."""
         return Place(row.q, row.sensor, row.marker, self._markers[row.marker])
 
     # Changes
@@ -371,7 +378,12 @@ class ReferenceWatch:
         displacements: Displacements,
         p_value: float,
     ) -> SetupChange:
-        """Change with the cause and the time that explain the rounds best (by BIC)."""
+        """Change with the cause and the time that explain the rounds best (by BIC).
+
+        ``kind`` is 'unexplained' if the best leaves too much (`UNEXPLAINED_P`,
+        `UNEXPLAINED_SHARE`). Causes within `LOOKS_ALIKE` of it are look-alikes; a drift must be
+        better by that than a step.
+        """
         rounds = range(self._begin, number + 1)
         keys = [
             key
@@ -503,7 +515,7 @@ class SetupChanges:
 
     @property
     def stops(self) -> bool:
-        """Whether the change is large enough to stop the collection."""
+        """Whether the change is larger than `stop_m`, so that the collection stops; not if 0."""
         change = self.change
         return change is not None and bool(self._stop_m) and change.size_m > self._stop_m
 
@@ -525,7 +537,11 @@ class SetupChanges:
         log: Iterable[tuple[str, int, Sequence[PairedReading]]],
         T_R_N: Mapping[str, FloatArray],
     ) -> None:
-        """Restore the state of an earlier recorder from its log (`SessionJournal.watched`)."""
+        """Restore the state of an earlier recorder from its log (`SessionJournal.watched`).
+
+        ``log``: kind (reference, accepted or other), configuration, readings. A change that stops
+        has `stopped_run` '' then: which run was stopped is not known.
+        """
         for kind, configuration, readings in log:
             if kind == 'reference':
                 self.read(configuration, readings, T_R_N)
@@ -546,7 +562,8 @@ class SetupChanges:
     ) -> bool:
         """Process the readings at a reference; returns whether there is something new to report.
 
-        ``last``: whether it is the last reference of its round.
+        ``configuration``: its number in the session; ``T_R_N``: registrations; ``last``: whether
+        it is the last reference of its round, which is judged then.
         """
         new = False
         for reading in readings:
@@ -563,7 +580,10 @@ class SetupChanges:
         return new
 
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> bool:
-        """Judge the round so far, once; returns as `read`."""
+        """Judge the round so far, once; returns whether there is something new to report.
+
+        New is another subject, growth by more than `GROWN`, or any change of a round that `stops`.
+        """
         self.change = self._watch.judge(T_R_N)
         if self.change is None or self.change is self._reported:
             return False
@@ -585,7 +605,7 @@ class SetupChanges:
         return SetupChanged(stops=self.stops, text=self.describe())
 
     def accept(self) -> None:
-        """Record that a person has checked the change: the next round is a new beginning."""
+        """Forget the change, which a person has checked: the next round is a new beginning."""
         self._watch.accept()
         self.change = self._reported = self.stopped_run = None
 

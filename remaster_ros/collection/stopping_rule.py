@@ -108,11 +108,14 @@ class StoppingRule:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of configurations after which the rule looks."""
+        """Numbers of configurations after which the rule looks: every `every`, and at the end."""
         return (*range(self.every, self.planned, self.every), self.planned)
 
     def limit(self, count: int) -> float:
-        """p-value below which a look finds structure; 0 if it makes no test."""
+        """p-value below which a look finds structure; 0 if it makes no test.
+
+        Tests are made at most at `MOST_TESTS` looks, the last one included.
+        """
         step = -(-len(self.counts) // MOST_TESTS)
         tested = self.counts[::-1][::step][::-1]
         if count not in tested:
@@ -126,8 +129,8 @@ class StoppingRule:
         """Fit of the first `count` configurations, and its judgement.
 
         ``session``: with at least as many configurations to fit; ``count``: one of `counts`;
-        ``before``: previous look, whose structure stays found; ``rng``: for the draws of the
-        noise.
+        ``before``: previous look, whose structure stays found; None for none; ``rng``: for the
+        draws of the noise. With too few data for a fit the look says so in `lacking`.
         """
         part, elapsed_s, pace_s = so_far(session, count)
         try:
@@ -180,7 +183,7 @@ class StoppingRule:
         )
 
     def is_enough(self, look: Look) -> bool:
-        """Whether the collection may end after this look."""
+        """Whether the collection may end after this look: a goal is stated, and reached."""
         return self.goal.stated and not look.lacking
 
     def describe(self, look: Look) -> str:
@@ -204,7 +207,7 @@ class StoppingRule:
         return f'{after}: {look.lacking}; {self._cost(look)}'
 
     def _cost(self, look: Look) -> str:
-        """Cost of the goal after a look, for people."""
+        """Cost of the goal after a look, in configurations and minutes, for people."""
         if look.more is None:
             return 'not known what it costs'
         time = '' if np.isnan(look.more_s) else f', {look.more_s / 60:.1f} min'
@@ -254,7 +257,7 @@ class StoppingRule:
 
 
 def _poses_of_configurations(found: Estimate) -> IntArray:
-    """Pose of each fitted configuration."""
+    """Pose of each fitted configuration, (n,), by number of the configuration."""
     measurements = found.problem.measurements
     kept = found.kept
     first = np.unique(measurements.configuration[kept], return_index=True)[1]

@@ -31,7 +31,7 @@ class PlanMemory(Protocol):
         """Begin a tour; ``expected``: expected precision of its fit."""
 
     def open_visit(self, visit: PoseVisit) -> None:
-        """Begin a visit."""
+        """Begin a visit, which becomes `visit`, and is kept before the arm moves."""
 
     def drop_remaining_fits(self) -> None:
         """Record that the remaining poses to fit are dropped."""
@@ -102,7 +102,10 @@ class TourProgress:
         return f'{poses} {self.phase} poses begun, {done} configurations done'
 
     def follow(self, recorder: RecorderState) -> bool:
-        """Update outcomes from the recorder; return whether any is new."""
+        """Update outcomes from the recorder; return whether any is new.
+
+        Outcomes of another plan than `memory.id` are ignored.
+        """
         previous, self._registered = self.decided, recorder.registered
         if recorder.plan == self._memory.id:
             self.decided = recorder.decided
@@ -122,7 +125,10 @@ class TourProgress:
 
     @property
     def open_pose(self) -> PoseVisit | None:
-        """The last visit with its solutions without an outcome; None if there are none."""
+        """The last visit with its solutions without an outcome; None if there are none.
+
+        Its paths are not planned: see `rest`.
+        """
         tour, visit = self._memory.tour, self._memory.visit
         if tour is None or visit is None:
             return None
@@ -131,7 +137,10 @@ class TourProgress:
         return tour.with_route(visit, remaining) if remaining else None
 
     def rest(self, q: FloatArray) -> PoseVisit | None:
-        """Return the remaining visit with paths from q, rad, (k,); None while it is planned."""
+        """Return the remaining visit with paths from q, (k,); None while it is planned.
+
+        q: rad or m. There must be an `open_pose`.
+        """
         tour, visit = self._memory.tour, self.open_pose
         assert tour is not None
         assert visit is not None
@@ -184,7 +193,10 @@ class TourProgress:
     def _next_registration(
         self, q: FloatArray, sensors: Collection[str], words: str
     ) -> PoseVisit | None:
-        """Begin the next visit of the registration; see `next`."""
+        """Begin the next visit of the registration; None while planned, and once registered.
+
+        Raises InsufficientDataError if all poses were visited without a registration.
+        """
         if self._registered:
             return None
         if self._memory.tour is None:
@@ -203,7 +215,11 @@ class TourProgress:
         return result[0] if result else None
 
     def _open(self, q: FloatArray) -> tuple[PoseVisit | None] | None:
-        """Begin the next visit; return it in a tuple, (None,) at the end, None while planned."""
+        """Begin the next visit; return it in a tuple, (None,) at the end, None while planned.
+
+        None also if the arm stands too near to something (`standing` says so), and once `enough`
+        has dropped the remaining poses to fit.
+        """
         tour = self._memory.tour
         assert tour is not None
         standing = self._tours.model.trouble(q)
@@ -250,7 +266,10 @@ class TourProgress:
         return PlannerState(state=state, run=run, planned=self.planned, further=further)
 
     def counts(self) -> dict[str, Any]:
-        """Return figures of the tour by name, for the status."""
+        """Return figures of the tour by name, for the status; names as in the status.
+
+        Sums over all tours of the session; outcomes and dropped ones with a prefix.
+        """
         tour, outcomes = self._memory.tour, self.decided.outcomes
         tours = self._memory.tours
         values: dict[str, Any] = {

@@ -70,7 +70,7 @@ class Conductor(Node):
         self._clients_by_name: dict[str, Any] = {}
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        """Keep the last summary of a node."""
+        """Keep the last summary of a node, its message and values, by name."""
         self.summaries[node] = {'message': message, **values}
 
     def _on_record(self, record: EventRecord) -> None:
@@ -80,7 +80,7 @@ class Conductor(Node):
         self.times.add(record.body)
 
     def call(self, service: str) -> Any:
-        """Call a std_srvs/Trigger service; return the future, None if it is not available."""
+        """Call a std_srvs/Trigger service; return the future, None if it is not ready now."""
         if service not in self._clients_by_name:
             self._clients_by_name[service] = self.create_client(Trigger, service)
         client = self._clients_by_name[service]

@@ -34,7 +34,7 @@ class ConfigurationTimes:
         self.rows: list[dict[str, float]] = []
 
     def add(self, event: Event | State) -> None:
-        """Take an event; only those of configurations count."""
+        """Take an event; only those of configurations count, not of a registration."""
         match event:
             case PoseAnnounced(split='registration', stamp=stamp):
                 self._registration.add(stamp)
@@ -57,7 +57,10 @@ class ConfigurationTimes:
                     self.rows.append(row)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return motion, settle, measuring (world s), software (wall s) of complete rows."""
+        """Return motion, settle, measuring (world s), software (wall s) of complete rows.
+
+        Name -> (n,); n = 0 if none is complete.
+        """
         needed = ('motion', 'settle', 'measuring', 'until_command')
         rows = [row for row in self.rows if all(name in row for name in needed)]
         table = {name: np.array([row[name] for row in rows]) for name in needed}

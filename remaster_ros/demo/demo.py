@@ -93,7 +93,10 @@ class Keyboard:
         return sys.stdin is not None and sys.stdin.isatty()
 
     def line(self) -> str | None:
-        """Return the last line typed since the last call, without waiting; None if none."""
+        """Return a line typed since the last call, in lower case, without waiting; None if none.
+
+        'f' if the terminal is closed.
+        """
         ready, _, _ = select.select([sys.stdin], [], [], 0.0)
         # A closed terminal gives an empty line: nobody to ask.
         return (sys.stdin.readline() or 'f').strip().lower() if ready else None
@@ -153,7 +156,10 @@ class Demo:
         )
 
     def run(self) -> bool:
-        """Collect, fit, print; return whether the collection is complete."""
+        """Collect, fit, print; return whether the collection is complete.
+
+        Raises DeviceError if a node fails or does not answer, KeyboardInterrupt after a signal.
+        """
         self.console.print(f'hidden world drawn with seed {self.p.seed}; starting the nodes')
         self.console.print(
             'the fake arm moves without a Cartesian speed limit (real.yaml: 0.25 m/s)'
@@ -191,7 +197,7 @@ class Demo:
     def _estimate(self) -> list[tuple[str, Path, str]]:
         """Fit the session and, if there are `requests`, look for causes.
 
-        Returns label, folder and file of each result.
+        Returns label, folder and file of each result. Raises DeviceError if a service refuses.
         """
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=WORK_WALL_S)
@@ -242,7 +248,7 @@ class Demo:
         )
 
     def _start(self) -> None:
-        """Start all nodes."""
+        """Start all nodes on the fake devices, with free ports; with `watch` the live page too."""
         common = config_path('fake.yaml')
         command_port, data_port, tracker_port = free_ports(
             socket.SOCK_DGRAM, socket.SOCK_DGRAM, socket.SOCK_STREAM
@@ -270,7 +276,11 @@ class Demo:
     def _start_core(
         self, session: Path, seed: int, size: int, held_out: int, compensation: str = ''
     ) -> None:
-        """Start the nodes of a collection; ``seed``: of the planner; ``size``: poses to fit."""
+        """Start the nodes of a collection; ``session``: its folder; ``seed``: of the planner.
+
+        ``size, held_out``: candidate poses to fit and to validate; ``compensation``: file by which
+        the bridge corrects, '' for none.
+        """
         rate, cell = {'simulated_clock_rate': self.p.rate}, {'cell': self.p.cell}
         # A fit of the corrected poses by an operator must not overwrite the first one.
         suffix = f'_of_{session.name}' if compensation else ''
@@ -317,7 +327,11 @@ class Demo:
         self._stopping.clear()
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for a condition; raise DeviceError after the timeout."""
+        """Wait for a condition; raise DeviceError after the timeout.
+
+        ``what``: for the message. Messages are handled meanwhile; KeyboardInterrupt after a
+        signal.
+        """
         deadline = time.monotonic() + timeout_s
         while not condition():
             if time.monotonic() > deadline:
@@ -336,7 +350,10 @@ class Demo:
         )
 
     def _collect_again(self) -> None:
-        """Call /remaster/collect, as an operator would, until it succeeds."""
+        """Call /remaster/collect, as an operator would, until it succeeds.
+
+        Raises DeviceError if it does not within `ANSWER_WALL_S`.
+        """
         deadline = time.monotonic() + ANSWER_WALL_S
         while True:
             try:
@@ -487,7 +504,10 @@ class Demo:
         return True
 
     def _clear_halt(self) -> None:
-        """Clear the halt, and collect, as an operator does after looking at the arm."""
+        """Clear the halt, and collect, as an operator does after looking at the arm.
+
+        `CLEARING_CALLS` times at most; a refusal is printed.
+        """
         for _ in range(CLEARING_CALLS):
             try:
                 self._trigger('remaster/clear_halt', 'robot_bridge')
@@ -515,7 +535,7 @@ class Demo:
 def output_folder(path: Path) -> Path:
     """Create a folder and its log/; or use an empty one, or that of an interrupted demo.
 
-    A demo that was interrupted before its session began has left only logs.
+    A demo that was interrupted before its session began has left only logs. Returns the folder.
     Raises InputError if the folder holds other files or cannot be written.
     """
     session = path / 'session'
@@ -536,7 +556,11 @@ def output_folder(path: Path) -> Path:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the demo; return its exit status."""
+    """Run the demo; return its exit status.
+
+    0 for a complete collection, 1 for one that ended with a halted arm, 130 after a signal; see
+    `running.report` for errors.
+    """
     # Messages stay on this machine, and do not reach other demos.
     os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -71,7 +71,7 @@ class NodeProcesses:
         """Restart killed processes, as a supervisor does; return their names.
 
         Raises DeviceError, with the last line of its log, if a process has ended by itself, or is
-        killed repeatedly just after its start.
+        killed more than `SHORT_LIVES` times in a row within `SHORT_LIFE_S` of its start.
         """
         killed = []
         for name, process in list(self._running.items()):
@@ -90,7 +90,7 @@ class NodeProcesses:
         return killed
 
     def pid(self, name: str) -> int:
-        """Return the id of the present process of a node."""
+        """Return the id of the present process of a node; KeyError if it was not started."""
         return self._running[name].pid
 
     def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
@@ -123,7 +123,7 @@ def free_ports(*kinds: int) -> list[int]:
 
 
 def _is_free(kind: int, port: int) -> bool:
-    """Return whether a socket can be bound to a port."""
+    """Whether a socket of this kind can be bound to a port on 127.0.0.1."""
     with socket.socket(socket.AF_INET, kind) as probe:
         try:
             probe.bind(('127.0.0.1', port))

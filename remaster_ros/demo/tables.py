@@ -33,7 +33,7 @@ def _table(title: str, *headings: str, left_aligned: int = 1) -> Table:
 
 
 def print_times(console: Console, times: ConfigurationTimes) -> None:
-    """Print the table of times per configuration."""
+    """Print the table of times per configuration: median, 95 % and largest, s."""
     columns = times.columns()
     title = f'time per configuration, s ({len(columns["motion"])} configurations)'
     table = _table(title, '', 'median', '95 %', 'largest')
