@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from arviz_stats.base import array_stats
 from scipy.signal import lfilter
 
 from remaster_ros.calibration.convergence import ess_bulk, ess_tail, r_hat
@@ -11,7 +10,15 @@ from remaster_ros.calibration.proposal import Weighted
 from remaster_ros.errors import InsufficientDataError
 
 
-def test_figures_are_those_of_arviz() -> None:
+@pytest.fixture(scope='module')
+def array_stats():
+    """Functions of arviz, whose import takes a second."""
+    from arviz_stats.base import array_stats
+
+    return array_stats
+
+
+def test_figures_are_those_of_arviz(array_stats) -> None:
     """Of each quantity by itself."""
     rng = np.random.default_rng(23)
     for trial in range(40):
@@ -32,7 +39,7 @@ def test_figures_are_those_of_arviz() -> None:
         np.testing.assert_allclose(ess_tail(x), tail, rtol=1e-8)
 
 
-def test_weights_are_smoothed_as_by_arviz() -> None:
+def test_weights_are_smoothed_as_by_arviz(array_stats) -> None:
     rng = np.random.default_rng(24)
     for trial in range(40):
         count = rng.integers(30, 5000)
