@@ -94,7 +94,10 @@ class Inputs:
 
     @property
     def gross(self) -> list[int]:
-        """``observation`` of the gross errors, by the discovery or, without one, by the fit."""
+        """``observation`` of the gross errors, by the discovery or, without one, by the fit.
+
+        By the fit: rows that were not fitted, then held-out rows of `NoiseCheck.gross`.
+        """
         if self.found is not None:
             return self.found.noise.outliers
         checks = self.fit.explained_by_noise
@@ -183,7 +186,11 @@ def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
 def _model(
     session: Session, result: Path, file: str, verb: str
 ) -> tuple[Path | None, FloatArray | None]:
-    """Path of a result's robot model and the errors with it, mm; both None if `file` is ''."""
+    """Path of a result's robot model, and the errors of all rows with it, mm, (n,).
+
+    Both None if ``file`` (as the result names it) is ''. ``result``: path of the result; ``verb``:
+    command that writes it. Raises InputError if the model is missing.
+    """
     if not file:
         return None, None
     path = result.parent / APPLY_FOLDER / MODEL_FILE
@@ -202,12 +209,15 @@ def all_taken_out(found: Discovered | None) -> bool:
 
 
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """3-D error of each row with the robot model of a URDF, mm, (n,)."""
+    """3-D error of each row with the robot model of a URDF (text), mm, (n,)."""
     return lengths_mm(errors_with_urdf(session, urdf))
 
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
-    """Raise InputError for the result of other data, or of a version that lacks needed keys."""
+    """Raise InputError for the result of other data, or of a version that lacks needed keys.
+
+    ``verb``: command of the remedy.
+    """
     if (
         not isinstance(result.session, msgspec.Struct)
         or not isinstance(result.judgement, msgspec.Struct)
@@ -307,7 +317,10 @@ class Answer:
 
     @property
     def plain_pad(self) -> bool:
-        """Whether the pad counts the joints as the URDF, and each is set where it shows 0."""
+        """Whether the pad counts the joints as the URDF, and each is set where it shows 0.
+
+        True also if there is nothing to set.
+        """
         return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
     @property
@@ -317,7 +330,10 @@ class Answer:
 
     @property
     def left_alone(self) -> list[str]:
-        """Names on the pad of the joints to leave as they are, whose offsets are unknown."""
+        """Names on the pad of the joints to leave as they are, whose offsets are unknown.
+
+        'A4 (joint_4)' if the pad's name differs from the URDF's.
+        """
         set_joints = {step.joint for group in self.on_the_pad for step in group}
         return [
             called if called == row.joint else f'{called} ({row.joint})'
@@ -328,7 +344,7 @@ class Answer:
 
     @property
     def files(self) -> list[str]:
-        """Names of the files in the folder ``apply`` that belong to the action."""
+        """Names of the files in the folder ``apply`` for the action; [] unless it is 'set'."""
         if self.action != 'set':
             return []
         return [name for name in ALL_FILES if self.loads_model or name != MODEL_FILE]
@@ -390,7 +406,7 @@ def answer_of(inputs: Inputs) -> Answer:
 def _on_the_pad(
     session: Session, offsets: Sequence[JointOffset]
 ) -> tuple[tuple[MasteringStep, ...], ...]:
-    """Steps on the pad for the offsets of a session."""
+    """Steps on the pad for the offsets of a session, in groups of coupled joints."""
     return mastering(
         session.controller,
         SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
@@ -401,7 +417,11 @@ def _on_the_pad(
 
 
 def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
-    """Mask of the rows by which the stages are judged, (n,), and whether they were held out."""
+    """Mask of the rows by which the stages are judged, (n,), and whether they were held out.
+
+    Held-out rows if there are any, else fitted ones; without gross errors, unless more than a
+    tenth of the held-out rows are (`LARGEST_SHARE`).
+    """
     m = inputs.session.measurements
     if m.is_validation.any():
         gross = m.is_validation & np.isin(m.observation, inputs.gross)
@@ -413,7 +433,10 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
 
 
 def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
-    """Title, and errors of all rows, mm, at each stage."""
+    """Title, and errors of all rows, mm, (n,), at each stage: today, zero-offsets, then the rest.
+
+    The rest is the robot model and all causes, as far as there are any.
+    """
     rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
     if inputs.causes_mm is not None and all_taken_out(inputs.found):
         return [*rows, ('with zero-offsets, measuring errors taken out', inputs.causes_mm)]
@@ -431,7 +454,11 @@ def _action(
     after: float,
     offsets: list[JointOffset],
 ) -> tuple[Literal['set', 'wait', 'nothing'], str]:
-    """Action, and the reason if it is not to set the offsets."""
+    """Action, and a sentence with the reason if it is not to set the offsets, else ''.
+
+    'wait' for a bad judgement or a cause of the arm that came at a moment; 'nothing' without an
+    identifiable offset or a gain of 10 % (`NOTICEABLE_GAIN`). ``before, after``: mean errors, mm.
+    """
     if judgement.mood == 'bad':
         return 'wait', f'Set nothing yet. {judgement.headline}'
     slipped = [e for e in effects if e.moment_s is not None and not e.of_measurement]
@@ -452,7 +479,10 @@ def _action(
 
 
 def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
-    """Noise by sensor: of the model with causes if there is one, else that assumed by the fit."""
+    """Noise by sensor: of the model with causes if there is one, else that assumed by the fit.
+
+    Sensors whose noise is unknown are left out.
+    """
     rows: list[SensorNoise] = []
     if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
         for sensor, noise in inputs.found.noise.sensors.items():
@@ -474,7 +504,10 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
 
 
 def _mood(inputs: Inputs, loads_model: bool, may_be_good: bool) -> Mood:
-    """Judgement: 'good' only if the fit, the discovery and the held-out poses all agree."""
+    """Judgement: 'good' only if the fit, the discovery and the held-out poses all agree.
+
+    ``may_be_good``: whether poses were held out and the action is not to wait.
+    """
     fit, found = inputs.judgement, inputs.found
     if fit.mood == 'bad':
         return 'bad'
@@ -501,7 +534,12 @@ def _headline(
     loads_model: bool,
     gross: int,
 ) -> str:
-    """Sentence with the action and its gain; ``measured``: titles of the measurement's errors."""
+    """Sentence with the action and its gain.
+
+    ``joints``: number of identifiable ones; ``brings``: index of the stage that the action
+    reaches; ``measured``: titles of the measurement's errors; ``gross``: number of held-out gross
+    errors that are not counted.
+    """
     before, after = stages[0], stages[brings]
     action = f'Set the zero-offset{"s" if joints > 1 else ""} of {counted(joints, "joint")}'
     if loads_model:
@@ -550,13 +588,17 @@ class Remaining(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Name, size and remedy in a sentence."""
+        """'Name: size. Remedy' as one text; without size or remedy these parts are left out."""
         size = self.size.rstrip('.')
         return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
 
 
 def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
-    """Errors that the action leaves, the causes first."""
+    """Errors that the action leaves, the causes first; at least one entry.
+
+    ``loads_model``: whether the action is to load the robot model, which takes its causes out;
+    ``held_out``: whether poses were held out.
+    """
     found, judgement = inputs.found, inputs.judgement
     rows = [] if found is None else _of_discovery(found, loads_model)
     if found is None and (lines := judgement.findings or judgement.doubts):
@@ -609,7 +651,10 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
 
 
 def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
-    """Causes that remain, and errors without a cause."""
+    """Causes that remain, and errors without a cause.
+
+    At most 4 causes (`MOST_NAMED`); the smaller ones share one entry.
+    """
     rows: list[Remaining] = []
     stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
     for effect in stay[:MOST_NAMED]:
@@ -634,7 +679,10 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
 
 
 def _gross(inputs: Inputs) -> Remaining | None:
-    """Number, sensors and time of the gross errors; None if there are few."""
+    """Number, sensors and time of the gross errors; None if there are few.
+
+    Few: below 3 (`FEWEST_GROSS`) or below 1 % of all readings (`LEAST_SHARE`).
+    """
     session, m = inputs.session, inputs.session.measurements
     rows = np.isin(m.observation, inputs.gross)
     if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):

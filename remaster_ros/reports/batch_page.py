@@ -99,7 +99,7 @@ def differing(values: FloatArray, level: float) -> list[int]:
 
 
 def _shown(one: Mapping[str, Any], key: str) -> str:
-    """Value of a joint with its unit, as text."""
+    """Value of a joint with sign and unit, four decimals; ``key`` as in 'median', without unit."""
     return f'{one[key + "_" + one["unit"]]:+.4f} {one["unit"]}'
 
 
@@ -108,8 +108,9 @@ def _joint(
 ) -> dict[str, Any]:
     """Row of a joint for the page: median, spread, sessions that differ, lasting change.
 
-    None for what is unknown; fewer than FEW sessions have median and spread alone. ``level``: of
-    `differing`.
+    None for what is unknown; fewer than 5 sessions (`FEW`) have median and spread alone.
+    ``index``: of the joint in each row, from 0; ``rows``: done sessions of one kind of arm;
+    ``level``: of `differing`.
     """
     unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
     known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]
@@ -137,7 +138,7 @@ def _joint(
 
 
 def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Fit of a row; without the advice to search for causes if that was done."""
+    """Fit of a row, without the advice to search for causes if that was done; None if absent."""
     fit = row.get('fit')
     if not fit or 'discovery' not in row:
         return fit
@@ -147,7 +148,11 @@ def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
 def write_batch_page(
     path: Path, rows: Sequence[Mapping[str, Any]], over_all: Mapping[str, Any]
 ) -> None:
-    """Write the page. Raises InputError if the file cannot be written."""
+    """Write the page of many sessions; an existing file is replaced.
+
+    ``rows``: rows of rows.jsonl; ``over_all``: of `summary_of`. Raises DiskError if the file
+    cannot be written.
+    """
     shown = [
         {
             'name': Path(row['session']).name,

@@ -49,7 +49,10 @@ def write_check_page(
 
 
 def _draw(trend: Trend) -> Figure:
-    """Figure of each joint's change over the checks, at the tool, mm."""
+    """Figure of each joint's change over the checks, at the tool, mm.
+
+    Only joints whose change could be detected have a panel.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 

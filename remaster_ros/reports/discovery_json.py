@@ -32,7 +32,10 @@ from remaster_ros.version import __version__
 def _with_exact_drawing(
     discovery: Discovery, rows: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Rows of zero-offsets with their std for an arm of exactly nominal geometry added."""
+    """Copies of rows of zero-offsets, with their std for an arm of exactly nominal geometry.
+
+    It is added as ``std_if_exactly_drawn_deg`` (or ``_mm``) if identifiable and finite.
+    """
     drawn = of_joints(discovery.fit.chain, std_if_exactly_drawn=discovery.std_if_drawn)
     found = []
     for row, exact in zip(rows, drawn, strict=True):
@@ -43,7 +46,7 @@ def _with_exact_drawing(
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
-    """Predictions of the final model for each row of the session."""
+    """Predictions of the final model for each row of the session, held-out rows as well."""
     context = discovery.residuals.context
     return predict(discovery.fit, context.measurements)
 
@@ -54,7 +57,10 @@ def discovery_content(
     predictions: Predictions | None = None,
     decided: Sequence[Decision] = (),
 ) -> Discovered:
-    """Checked content of discovery.json, as an object; predictions are computed if not given."""
+    """Checked content of discovery.json, as an object; predictions are computed if not given.
+
+    ``confirmation``: by another session; ``decided``: decisions between causes and look-alikes.
+    """
     predictions = predictions_of(discovery) if predictions is None else predictions
     fit = estimates(discovery.fit)
     before, before_std = discovery.offsets_before
@@ -109,7 +115,8 @@ def discovery_content(
 def _covariance(discovery: Discovery) -> dict[str, Any]:
     """Posterior covariance of identifiable offsets and of the named causes' parameters.
 
-    compensation.json has that of all terms of the model.
+    Keys names, units and matrix (six figures). compensation.json has that of all terms of the
+    model.
     """
     fit = discovery.fit
     units = {n: c.unit for group in discovery.groups for c in group for n in c.parameters}
@@ -128,7 +135,7 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
 
 
 def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
-    """Share of held-out and fitted rows in their predicted 95 % regions."""
+    """Share of held-out and fitted rows, without gross errors, in their predicted 95 % regions."""
     measurements = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.outliers]
     kept = ~np.isin(measurements.observation, gross)

@@ -98,7 +98,7 @@ def draw_fit(result: FitResult) -> dict[str, str]:
 
 
 def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
-    """Function that draws each figure of a fit, by file name without ending."""
+    """Function that draws each figure of a fit, by file name without ending; the fit is unused."""
     return {
         'posteriors': posteriors,
         'traces': traces,
@@ -112,13 +112,16 @@ def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
 def as_figures(
     figures: Mapping[str, Callable[[Drawn], Figure]], subject: Drawn
 ) -> dict[str, Figure]:
-    """Figures of a fit or a discovery, by the same names."""
+    """Figures of a subject (fit, discovery or report), drawn in the style of reports, by name."""
     with matplotlib.rc_context(STYLE):
         return {name: draw(subject) for name, draw in figures.items()}
 
 
 def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dict[str, str]:
-    """Figures of a fit or a discovery as SVG text, by the same names."""
+    """Figures of a subject (fit, discovery or report) as SVG text, by name.
+
+    The same subject gives the same text.
+    """
     texts = {}
     for name, draw in figures.items():
         # The salt makes the same result give the same file.
@@ -131,12 +134,18 @@ def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dic
 
 
 def evenly(count: int, most: int) -> IntArray:
-    """At most `most` of the numbers 0 to count - 1, evenly spaced, with both ends."""
+    """At most ``most`` of the numbers 0 to count - 1, evenly spaced, ascending, with both ends.
+
+    [] for a count of 0.
+    """
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 
 
 def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = None) -> FloatArray:
-    """Base, joints and tip of arms at n configurations, rad, m, (n, k + 2, 3)."""
+    """Base, joints and tip of arms at n configurations (n, k), in R, m, (n, k + 2, 3).
+
+    ``q``: rad, m for slides; ``offsets``: zero-offsets to add, (k,), or None.
+    """
     joints = chain.frames(q, offsets)[..., :3, 3]
     tips = chain.forward(q, offsets)[:, None, :3, 3]
     return np.concatenate((np.zeros((len(q), 1, 3)), joints, tips), axis=1)
@@ -334,7 +343,10 @@ def accuracy_map(result: FitResult) -> Figure:
 
 
 def error_histograms(ax: Axes, before: FloatArray, after: FloatArray) -> None:
-    """Draw the distributions of 3-D errors before and after, mm, with their means."""
+    """Draw the distributions of 3-D errors before and after, mm, (n,) each, with their means.
+
+    The axis is logarithmic; errors below the 0.2 % quantile are drawn there.
+    """
     both = np.concatenate((before, after))
     floor = max(float(np.quantile(both, 0.002)), 1e-4)
     count = int(np.clip(3 * np.sqrt(len(before)), 8, 45))
@@ -383,7 +395,10 @@ def _panels(
 def _joint_panels(
     result: FitResult, height_in: float, left: float, top: float
 ) -> tuple[Figure, list[Axes]]:
-    """Figure with a titled panel for each joint, two in a row."""
+    """Figure with a titled panel for each joint, two in a row, and the k panels.
+
+    ``height_in``: of a row, inches; ``left``, ``top``: margins, inches.
+    """
     joints = result.joint_names
     rows = -(-len(joints) // 2)
     figure, axes = _panels(
@@ -402,7 +417,7 @@ def _stacked(count: int, height_in: float) -> tuple[Figure, list[Axes]]:
 
 
 def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
-    """Put the legend above the panel at the right, in one row."""
+    """Put the legend above the panel at the right, in one row; None: the panel's own entries."""
     shown: Sequence[Artist] = ax.get_legend_handles_labels()[0] if handles is None else handles
     ax.legend(
         handles=shown,
@@ -416,7 +431,7 @@ def legend_above(ax: Axes, handles: list[Line2D] | None = None) -> None:
 
 
 def legend_entry(marker: str, color: str, name: str) -> Line2D:
-    """Entry of a legend for points of a marker and colour; a long name is cut."""
+    """Entry of a legend for points of a marker and colour; a name over 20 characters is cut."""
     return Line2D(
         [],
         [],
@@ -443,7 +458,7 @@ def _short(why: str) -> str:
 
 
 def log_axis(ax: Axes, which: str) -> None:
-    """Make an axis logarithmic, labelled in plain numbers at 1, 2 and 5."""
+    """Make an axis ('y', else x) logarithmic, labelled in plain numbers at 1, 2 and 5."""
     axis = ax.yaxis if which == 'y' else ax.xaxis
     (ax.set_yscale if which == 'y' else ax.set_xscale)('log')
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -458,7 +473,10 @@ def _norms_mm(result: FitResult) -> tuple[FloatArray, FloatArray]:
 
 
 def _splits(result: FitResult) -> list[tuple[str, BoolArray]]:
-    """Title and mask of the splits that have rows; gross errors are not among the fitted."""
+    """Title and mask (n,) of the splits that have rows, held-out ones first.
+
+    Gross errors are not among the fitted rows.
+    """
     m = result.session.measurements
     left_out = np.isin(m.observation, [observation for observation, _ in result.left_out])
     splits = [
@@ -492,7 +510,10 @@ def draw_discovery(discovery: Discovery) -> dict[str, str]:
 
 
 def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], Figure]]:
-    """Function that draws each figure of a discovery, by file name without ending."""
+    """Function that draws each figure of a discovery, by file name without ending.
+
+    'causes' only if there are any.
+    """
     figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
     if discovery.groups:
         figures['causes'] = causes
@@ -539,7 +560,11 @@ def gain(discovery: Discovery) -> Figure:
 
 
 def drivers(discovery: Discovery) -> Figure:
-    """Draw the errors along each joint's motion against each driver."""
+    """Draw the errors along each joint's motion against each driver, before and after.
+
+    A row of panels for each driver that the session has (own angle, gravity, last move, time,
+    temperature), a column for each joint.
+    """
     data = discovery.residuals
     context = data.part
     shown = context.chain.shown_scale
@@ -599,7 +624,11 @@ def drivers(discovery: Discovery) -> Figure:
 
 
 def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
-    """Draw means with their standard errors in bins of equal counts."""
+    """Draw means of y with their standard errors in bins of equal counts of x, (n,) each.
+
+    Nothing if x spans less than 0.001. Parts with a gap of over an eighth of the range (`EMPTY`)
+    are separate lines.
+    """
     if np.ptp(x) < 1e-3:
         return
     order = np.argsort(x)
@@ -618,7 +647,7 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 def causes(discovery: Discovery) -> Figure:
     """Draw each cause of a joint, or of a moment: residuals without it, and the fit with its band.
 
-    The sizes of all other causes stand in one panel.
+    At most 16 panels (twice `MOST_CAUSES`). The sizes of all other causes are in one panel.
     """
     panels = [
         candidate
@@ -646,7 +675,7 @@ def causes(discovery: Discovery) -> Figure:
 
 
 def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> None:
-    """Draw the sizes of the causes without a curve, and the noise."""
+    """Draw the sizes of the causes without a curve, RMS at the marker, mm, and the noise."""
     sizes = [1e3 * effect.size_m for effect in effects]
     noise = 1e3 * discovery.gain.noise_floor_m
     y = np.arange(len(sizes) + 1)
@@ -662,7 +691,7 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
 
 
 def _estimate(discovery: Discovery, candidate: Candidate) -> FloatArray:
-    """Parameters of a cause in the whole model, in which they may belong to a larger candidate."""
+    """Parameters (p,) of a cause in the whole model, perhaps those of a larger candidate."""
     solution = discovery.solution
     names = [name for one in solution.candidates for name in one.parameters]
     return solution.parameters[[names.index(name) for name in candidate.parameters]]
@@ -705,7 +734,8 @@ def _driver(
 ) -> tuple[str, FloatArray, float]:
     """Label and values (n,) of a cause's driver, and the driver's value for one shown unit.
 
-    A driver of several numbers is drawn by the feature of the cause's first parameter.
+    A driver of several numbers is drawn by the feature of the cause's first parameter, features
+    being (n, p).
     """
     driver = driver_named(context, candidate.driver, candidate.joints[-1])
     if driver is None:
@@ -716,7 +746,11 @@ def _driver(
 
 
 def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
-    """Draw one cause at a joint's angle, in arc minutes, or in mm for a prismatic joint."""
+    """Draw one cause at a joint's angle, in arc minutes, or in mm for a prismatic joint.
+
+    Points are residuals without the cause; the line is the posterior mean, the band ± 2 standard
+    deviations. A change is drawn only where it is present.
+    """
     data, solution = discovery.residuals, discovery.solution
     whole = len(data.context) <= MOST_DRAWN
     context = data.context if whole else data.part
@@ -855,7 +889,10 @@ class Subject(NamedTuple):
 
 
 def draw_answer(subject: Subject) -> dict[str, str]:
-    """All figures of a report as SVG text, by file name without ending."""
+    """All figures of a report as SVG text, by name without ending: stages, session, workspace.
+
+    'plan' as well if the session has a plan.
+    """
     figures: dict[str, Callable[[Subject], Figure]] = {
         'session': over_session,
         'workspace': workspace,
@@ -866,7 +903,7 @@ def draw_answer(subject: Subject) -> dict[str, str]:
 
 
 def draw_stages(answer: Answer) -> dict[str, str]:
-    """Figure of the first screen as SVG text, by its name."""
+    """Figure of the errors by stage as SVG text, by its name 'stages'."""
     return as_svg({'stages': stages}, answer)
 
 
@@ -945,7 +982,7 @@ def over_session(subject: Subject) -> Figure:
 
 
 def _mark_moments(ax: Axes, subject: Subject) -> None:
-    """Mark the moments of causes that came at once."""
+    """Mark the moments of causes that came at once by dashed lines with their titles."""
     found = subject.inputs.found
     for effect in found.effects if found is not None else ():
         if effect.moment_s is None:
@@ -966,7 +1003,10 @@ def _mark_moments(ax: Axes, subject: Subject) -> None:
 
 
 def workspace(subject: Subject) -> Figure:
-    """Draw the markers' positions from above and from the side, coloured by remaining error."""
+    """Draw the markers' positions from above and from the side, coloured by remaining error.
+
+    At most 1,500 rows (`SCATTER_POINTS`) and 4 arms (`ARMS`), evenly spread.
+    """
     inputs, chain = subject.inputs, subject.chain
     m = inputs.session.measurements
     frames = inputs.T_R_N
@@ -1007,7 +1047,10 @@ def workspace(subject: Subject) -> Figure:
 
 
 def planned(subject: Subject) -> Figure:
-    """Draw planned tool positions from above and from the side, and how they ended."""
+    """Draw planned tool positions from above and from the side, and how they ended.
+
+    The session has to have a plan. A pose is 'not measured' if none of its solutions was recorded.
+    """
     from remaster_ros.planning.tour_order import FITTED, REFERENCE
 
     plan, chain = subject.inputs.plan, subject.chain
@@ -1052,9 +1095,10 @@ def planned(subject: Subject) -> Figure:
 def two_views(
     figure: Figure, everything: FloatArray, frames: dict[str, FloatArray]
 ) -> list[tuple[Axes, tuple[int, int]]]:
-    """Panels from above and from the side, with the sensors, each with its two axes.
+    """Panels from above and from the side, with the sensors, each with its two axes (indices).
 
-    ``everything``: points that must be inside, in the robot base, m, (n, 3).
+    ``everything``: points that must be inside, in the robot base, m, (n, 3); ``frames``: T_R_N by
+    sensor.
     """
     middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     reach = 0.55 * float(np.ptp(everything, axis=0).max())
@@ -1079,7 +1123,7 @@ def _with_room() -> ConstrainedLayoutEngine:
 
 
 def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
-    """Legend entries of `two_views` for the sensors."""
+    """Legend entries of `two_views` for the sensors: letter, name and distance from the base."""
     labels = [
         f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
         for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
@@ -1094,7 +1138,10 @@ def _sensors(
     reach: float,
     plane: tuple[int, int],
 ) -> None:
-    """Draw a sensor at its position, or the direction to one outside the panel."""
+    """Draw each sensor's letter at its position, or an arrow to one outside the panel.
+
+    ``middle``: of the panel in R, (3,), m; ``reach``: half its width, m; ``plane``: its two axes.
+    """
     for letter, T in zip(LETTERS, frames.values(), strict=False):
         centre = middle[list(plane)]
         way = T[:3, 3][list(plane)] - centre
@@ -1119,7 +1166,7 @@ def _sensors(
 
 
 def _two_lines(text: str) -> str:
-    """A title broken near its middle."""
+    """Title broken near its middle; one of fewer than three words is unchanged."""
     words = text.split(' ')
     if len(words) < 3:
         return text

@@ -43,7 +43,7 @@ FIT_LIMIT = 64 * 1024**2
 
 
 def estimates(result: FitResult) -> dict[str, Any]:
-    """Estimates of a fit as fit.json and discovery.json have them.
+    """Estimates of a fit as fit.json and discovery.json have them, not yet checked.
 
     Keys: robot, session, joint_offsets, registration, markers, noise, sampler.
     """
@@ -73,7 +73,7 @@ def estimates(result: FitResult) -> dict[str, Any]:
 
 
 def _offsets(result: FitResult) -> list[dict[str, Any]]:
-    """Rows of joint_offsets."""
+    """Rows of joint_offsets, in joint order: name, identifiable, why, mean, std, interval95."""
     rows = table_rows(joint=result.joint_names, identifiable=result.identifiable, why=result.why)
     values = of_joints(
         result.chain,
@@ -98,7 +98,10 @@ def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
-    """Key geometry of fit.json."""
+    """Content of the key geometry of fit.json, of link lengths and axis tilts.
+
+    With the length or tilt that changes each identifiable offset most.
+    """
 
     def std_mm(name: str) -> float | None:
         """RMS displacement by the lengths or tilts, mm; None if the fit has none."""
@@ -134,7 +137,7 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
 
 
 def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
-    """Key orientation of fit.json."""
+    """Content of the key orientation of fit.json, in degrees, or the reason if none is fitted."""
     information = found.information
     return {
         'fitted': not found.why_not,
@@ -163,7 +166,10 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
 
 
 def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
-    """Std of each offset from the positions alone, degrees, and mm for prismatic joints."""
+    """Std of each identifiable offset from the positions alone, by name; None if infinite.
+
+    Key 'std_positions_deg', and '…_mm' if there are prismatic joints; empty without orientations.
+    """
     found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
     information = None if result.orientations is None else result.orientations.information
     if information is None:
@@ -176,7 +182,7 @@ def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
 
 
 def fit_content(result: FitResult) -> schemas.Fit:
-    """Content of fit.json."""
+    """Checked content of fit.json, as an object; keys without a value are unset."""
     draws = result.draws.reshape(-1, result.draws.shape[-1])
     content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,
@@ -220,19 +226,22 @@ def fit_content(result: FitResult) -> schemas.Fit:
 
 
 def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return how late the stamps of sensors are, s, as files have it."""
+    """Delays of the sensors' stamps and their stds, s, as files have them, in ms."""
     return {
         name: {'late_ms': 1e3 * late, 'std_ms': 1e3 * std} for name, (late, std) in clocks.items()
     }
 
 
 def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
-    """Rows of equally long columns."""
+    """Rows, as dicts by column name, of equally long columns.
+
+    Raises ValueError if the columns differ in length.
+    """
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _describe(session: Session) -> dict[str, Any]:
-    """Counts, sensors and origin of a session."""
+    """Counts by split, sensors and origin of a session, as the key session has them."""
     m = session.measurements
     counts = {
         name: {
@@ -264,9 +273,10 @@ def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
 
 
 def read_result(path: Path, schema: type[Record], form: str, name: str, verb: str) -> Record:
-    """Read the file `name` that the command `verb` wrote, and check its format and schema.
+    """Read the file ``name`` that the command ``verb`` wrote, as a record of the schema.
 
-    Raises InputError if it is damaged, of another format, or lacks a key.
+    ``form``: its format. Raises InputError if it is missing, damaged, of another format, or lacks
+    a key.
     """
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     return decoded(data, path, schema, form, f'give a {name} of format {form}')
@@ -317,6 +327,6 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
 
 
 def require_own(path: Path, format_: str) -> None:
-    """Raise InputError if a file to be replaced is not a JSON file of this format."""
+    """Raise InputError if a file to be replaced is unreadable or no JSON file of this format."""
     if format_of(read_limited(path, FIT_LIMIT, 'it was there')) != format_:
         raise InputError(f'{path}: is there and is no {format_}; it is not replaced, name another')

@@ -94,7 +94,10 @@ def earlier_pairs(
 
 
 def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovered:
-    """Content of a discovery.json. Raises InputError if its arm has other joints."""
+    """Content of a discovery.json; no joint names stand for any arm.
+
+    Raises InputError if it is no discovery.json or its arm has other joints.
+    """
     found = read_discovery(path)
     names = found.robot.joint_names if found.robot else joint_names
     if joint_names and list(names) != list(joint_names):

@@ -99,7 +99,11 @@ class BoundedServer(HTTPServer):
         PeriodicCallback(self._close_late, 500.0).start()
 
     def handle_stream(self, stream: IOStream, address: tuple[Any, ...]) -> None:
-        """Accept a connection, and close another one if there are too many."""
+        """Accept a connection, and close the oldest one if there are too many.
+
+        Too many: 64 of its own address (`MOST_EACH`), or 128 of all (`MOST`), then of the address
+        with the most. Those without the token are closed first.
+        """
         connection = self._open[stream] = _OpenConnection(_network(str(address[0])))
         counts = Counter(other.address for other in self._open.values())
         if counts[connection.address] > MOST_EACH:
@@ -116,7 +120,7 @@ class BoundedServer(HTTPServer):
         self._open.pop(server_conn.stream, None)
 
     def trust(self, request: HTTPServerRequest) -> None:
-        """Mark the connection of a request as one that has shown the token."""
+        """Mark the connection of a request, if open, as one that has shown the token."""
         if (connection := self._open.get(_stream(request))) is not None:
             connection.has_token = True
 
@@ -135,11 +139,14 @@ class BoundedServer(HTTPServer):
         self._close(next(stream for stream, _ in self._of(address) if id(stream) == worst))
 
     def _of(self, address: str) -> list[tuple[IOStream, _OpenConnection]]:
-        """Connections of an address."""
+        """Open connections of an address, with their streams."""
         return [item for item in self._open.items() if item[1].address == address]
 
     def _close_late(self) -> None:
-        """Close connections whose request does not come, or whose answer is not read."""
+        """Close connections whose request does not come, or whose answer is not read.
+
+        After 5 s without the token, 30 s with it, 60 s while an answer is sent.
+        """
         now = time.monotonic()
         for stream, connection in list(self._open.items()):
             allowed = IDLE_S if connection.has_token else REQUEST_S
@@ -159,7 +166,10 @@ def _stream(request: HTTPServerRequest) -> IOStream:
 
 
 def _network(address: str) -> str:
-    """Key of one user's addresses: an IPv4 address, or a network of IPv6."""
+    """Key of one user's addresses: an IPv4 address, or the /64 network of an IPv6 one.
+
+    Text that is no address is unchanged.
+    """
     with contextlib.suppress(ValueError):
         if isinstance(
             parsed := ipaddress.ip_address(address.partition('%')[0]), ipaddress.IPv6Address
@@ -176,11 +186,14 @@ class _RareHandler(logging.Handler):
         self._next_s, self._left_out = float('-inf'), 0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, or count it."""
+        """Write the text of a record in one line, or count it; see `note`."""
         self.note(' '.join(record.getMessage().split()))
 
     def note(self, text: str) -> None:
-        """Write a line, or count it."""
+        """Write a line to stderr, or count it if one was written within the last minute.
+
+        A line that cannot be written at once is dropped.
+        """
         now = time.monotonic()
         if now < self._next_s:
             self._left_out += 1
@@ -196,7 +209,7 @@ class _RareHandler(logging.Handler):
 
 
 def log_rarely(loop: asyncio.AbstractEventLoop) -> None:
-    """Report errors of tornado and of a loop in one line a minute."""
+    """Report errors of tornado and of an event loop in one line a minute on stderr."""
     handler = _RareHandler()
     logger = logging.getLogger('tornado')
     logger.handlers, logger.propagate = [handler], False
@@ -224,7 +237,11 @@ class Place:
 
 
 def listen(place: Place) -> socket.socket:
-    """Socket that listens at a place. Raises InputError if it cannot."""
+    """Non-blocking socket that listens at a place.
+
+    Raises InputError if the address is no IP address, is not a loopback address without a
+    certificate, or cannot be used.
+    """
     try:
         address = ipaddress.ip_address(place.address)
     except ValueError:
@@ -262,7 +279,10 @@ def tls(place: Place) -> ssl.SSLContext | None:
 
 
 def hosts(place: Place, port: int) -> tuple[str, ...]:
-    """Allowed values of the header Host; the first one is in the page's address."""
+    """Allowed values of the header Host, 'name:port'; the first is in the page's address.
+
+    ``port``: that of the socket.
+    """
     address = ipaddress.ip_address(place.address)
     shown = f'[{address}]' if address.version == 6 else str(address)
     names = [*place.names]
@@ -346,21 +366,21 @@ class LiveServer:
 
     @property
     def watched(self) -> bool:
-        """Whether anybody has requested the view within the last seconds."""
+        """Whether anybody has requested the view within the last 5 s (`WATCHED_S`)."""
         return time.monotonic() - self._asked_s < WATCHED_S
 
     def publish(self, view: dict[str, Any]) -> None:
-        """Show a view from now on.
+        """Show a view from now on; any thread may call this.
 
         Its ``seen`` is the mark that `collect` and `confirm` have to name; its ``confirmation``
-        has the plan that they confirm.
+        has the plan that they confirm, or is None.
         """
         content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
         plan = view['confirmation']['plan'] if view['confirmation'] else ''
         self._loop.call_soon_threadsafe(self._show, content, str(view['seen']), plan)
 
     def _show(self, content: bytes, seen: str, plan: str) -> None:
-        """Replace page and plan, note number and time of the view; in the server's thread."""
+        """Replace view and plan, note number and time of the view; runs in the server's thread."""
         self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
         self._view, self._seen, self._plan = content, seen, plan
 
@@ -384,14 +404,18 @@ class LiveServer:
         )
 
     def view(self) -> bytes:
-        """The view as JSON, with its number and age."""
+        """The view as JSON with its number and age, s; notes that somebody watches."""
         self._asked_s = time.monotonic()
         number, issued_s = self._issued[-1]
         age_s = min(self._asked_s - issued_s, 1e6)
         return b'{"number":%d,"age_s":%.2f,"view":%s}' % (number, age_s, self._view)
 
     def refusal(self, seen: SeenView) -> str:
-        """Reason why a person who has seen this view must look again; '' if it is current."""
+        """Reason why a person who has seen this view must look again; '' if it is current.
+
+        Refused are views over 3 s old (`FRESH_S`), used before, or of another state. One that is
+        accepted counts as used.
+        """
         issued = dict(self._issued).get(seen.view, float('-inf'))
         if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
             return 'the page was not up to date; look again'
@@ -416,12 +440,12 @@ class LiveServer:
         self._connections.note_answer(request)
 
     def close(self) -> None:
-        """End the server and its thread."""
+        """Stop the server and wait up to 5 s for its thread."""
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(5.0)
 
     def _run(self) -> None:
-        """Serve until the loop is stopped."""
+        """Serve until the loop is stopped, then close all connections; body of the thread."""
         asyncio.set_event_loop(self._loop)
         log_rarely(self._loop)
         application = Application(
@@ -460,9 +484,11 @@ class _Handler(RequestHandler):
     SUPPORTED_METHODS = ('GET', 'HEAD', 'POST')  # type: ignore[assignment]
 
     def initialize(self, server: LiveServer) -> None:
+        """Store the server that the application passes."""
         self._server = server
 
     def on_finish(self) -> None:
+        """Begin the time for the connection's next request."""
         self._server.note_answer(self.request)
 
     def set_default_headers(self) -> None:
@@ -487,11 +513,12 @@ class _Handler(RequestHandler):
             raise HTTPError(403, reason='the request comes from another page')
 
     def write_error(self, status_code: int, **_: Any) -> None:
+        """Answer an error as JSON: done false, and the reason as message."""
         self.set_header('Content-Type', 'application/json')
         self.finish(json.dumps({'done': False, 'message': self._reason}))
 
     def _packed(self, content: bytes, kind: str) -> None:
-        """Answer with content that is compressed already."""
+        """Answer with content that is gzip-compressed already; ``kind``: its Content-Type."""
         self.set_header('Content-Type', kind)
         self.set_header('Content-Encoding', 'gzip')
         self.finish(content)
@@ -499,6 +526,7 @@ class _Handler(RequestHandler):
 
 class _File(_Handler):
     def get(self) -> None:
+        """Answer with the fixed file of the requested name."""
         self._packed(*self._server.files[self.request.path.removeprefix('/')])
 
 
@@ -518,6 +546,7 @@ class _Plan(_Handler):
 
 class _Nothing(_Handler):
     def prepare(self) -> None:
+        """Refuse any address that is not served, HTTPError 404."""
         super().prepare()
         raise HTTPError(404, reason='there is no such page')
 
@@ -535,12 +564,14 @@ class _WithToken(_Handler):
 
 class _View(_WithToken):
     def get(self) -> None:
+        """Answer with the current view as JSON."""
         self.set_header('Content-Type', 'application/json')
         self.finish(self._server.view())
 
 
 class _Scene(_WithToken):
     def get(self) -> None:
+        """Answer with the fixed part of the 3-D view as JSON."""
         self._packed(self._server.scene, 'application/json')
 
 
@@ -548,8 +579,8 @@ class _Command(_WithToken):
     async def post(self, name: str) -> None:
         """Send a command to its node and answer with its outcome; a long fit counts as 'fitting'.
 
-        HTTPError: 404 unknown, 409 nothing to confirm or outdated view, 400 no view, 504 no
-        answer.
+        HTTPError: 404 unknown, 409 nothing to confirm or outdated view, 400 no view, 504 no answer
+        within 5 s (`ANSWER_S`).
         """
         if name not in COMMANDS:
             raise HTTPError(404, reason='there is no such command')
@@ -580,14 +611,14 @@ class _Command(_WithToken):
 
 
 def _set(future: asyncio.Future[tuple[bool, str]], outcome: tuple[bool, str]) -> None:
-    """Set the result of a future that may be done."""
+    """Set the result of a future, unless it is done already."""
     if not future.done():
         future.set_result(outcome)
 
 
 @cache
 def _files() -> dict[str, tuple[bytes, str]]:
-    """Compressed files of the page by name, with their types."""
+    """Gzip-compressed files of the page by name ('' is the page itself), with their types."""
     folder = importlib.resources.files(__package__).joinpath('live_page')
     plotly = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
     script = 'text/javascript; charset=utf-8'

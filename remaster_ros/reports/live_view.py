@@ -114,7 +114,11 @@ class LiveView:
     def take_summary(
         self, node: str, level: str, message: str, values: Mapping[str, str], now_s: float
     ) -> None:
-        """Take a status of a node from /remaster/status."""
+        """Take a status of a node from /remaster/status; beyond 30 nodes unknown ones are ignored.
+
+        ``level``: such as 'ok'; ``values``: counts and plan of the planner; ``now_s``: time of
+        reception.
+        """
         if node not in self._nodes and len(self._nodes) >= MOST_NODES:
             return
         self._nodes[node] = _Node(level, _clip(message), now_s)
@@ -126,7 +130,7 @@ class LiveView:
             self._pace.update(self._count('configurations_done'), now_s, running=running)
 
     def take(self, body: events.State | events.Event, now_s: float) -> None:
-        """Take a record of /remaster/events."""
+        """Take a record of /remaster/events: keep a state, make a message of an event."""
         match body:
             case events.PlannerState():
                 self._planner = body
@@ -147,7 +151,10 @@ class LiveView:
                 self._add_message(body, now_s)
 
     def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
-        """Note the end of a configuration."""
+        """Note the end of a configuration: its residuals count if it was recorded.
+
+        Any result but 'recorded' gives a message.
+        """
         recorded = end.result in ('recorded', 'partial')
         q = self._open.pop((end.stamp, end.solution), None)
         registering = self._values.get('phase') == 'registration'
@@ -156,7 +163,7 @@ class LiveView:
             self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
 
     def _add_message(self, body: events.State | events.Event, now_s: float) -> None:
-        """Add a message on an event that a person should see."""
+        """Add a message on a failed solution, stop, halt or change; other events add none."""
         match body:
             case events.SolutionFailed(reason=reason):
                 text = f'configuration failed: {reason}'
@@ -177,27 +184,33 @@ class LiveView:
         self._plan_page = page
 
     def take_joints(self, q: FloatArray) -> None:
-        """Take the arm's joint positions, rad, (k,)."""
+        """Take the arm's joint positions, rad or m, (k,); ignored if one is not finite."""
         if np.all(np.isfinite(q)):
             self._q = q
 
     def take_target(self, T_R_T: FloatArray) -> None:
-        """Take the target pose of the tool, (4, 4)."""
+        """Take the target pose of the tool, T_R_T, (4, 4); ignored if not finite."""
         if np.all(np.isfinite(T_R_T)):
             self._target = T_R_T
 
     def take_way(self, way: FloatArray) -> None:
-        """Take the next configurations on the arm's path, rad, (n, k)."""
+        """Take the next configurations of the arm, rad or m, (n, k), of which 200 are drawn.
+
+        Ignored if one is not finite.
+        """
         if np.all(np.isfinite(way)):
             self._way = tool_path(self._chain, way[:LONGEST_WAY])
 
     def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
-        """Take the registration of a sensor, (4, 4)."""
+        """Take the registration of a sensor, T_R_N, (4, 4); ignored if unknown or not finite."""
         if sensor in self._sensors and np.all(np.isfinite(T_R_N)):
             self.registration[sensor] = T_R_N
 
     def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
-        """Take zero-offsets of a fit and their standard deviations, joint -> rad or m."""
+        """Take zero-offsets of a fit and their standard deviations, joint -> rad or m.
+
+        Ignored unless all joints have finite ones; residuals are corrected by them from then on.
+        """
         names = self._chain.joint_names
         values = [by_name.get(name, np.nan) for by_name in (means, stds) for name in names]
         if np.all(np.isfinite(values)):
@@ -205,7 +218,7 @@ class LiveView:
             self.residuals.use_offsets(np.array([means[name] for name in names]))
 
     def take_fit(self, fit: FitFacts) -> None:
-        """Take further facts of the fit whose offsets were taken."""
+        """Take further facts of the fit whose offsets were taken, and use its markers."""
         self._fit = fit
         self.residuals.use_markers(fit.markers)
 
@@ -224,7 +237,7 @@ class LiveView:
         return (plan, page) if page and _PLAN_NAME.fullmatch(plan) else ('', '')
 
     def view(self, now_s: float) -> dict[str, Any]:
-        """Content of the page now, of plain types."""
+        """Content of the page at a time, s, of plain types."""
         return {
             'run': self._run(now_s),
             'halted': _clip(self._bridge.halted) if self._bridge else '',
@@ -257,11 +270,11 @@ class LiveView:
         return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def _silent(self, node: str, now_s: float) -> bool:
-        """Whether a node was not heard for `SILENT_S`."""
+        """Whether a node was not heard for 3 s (`SILENT_S`)."""
         return now_s - self._nodes[node].heard_s > SILENT_S
 
     def _count(self, name: str) -> int:
-        """A count of the planner's status; 0 if it is no number."""
+        """Count of this name in the planner's status; 0 if it is missing or no number."""
         try:
             return int(self._values.get(name, '0'))
         except ValueError:
@@ -293,7 +306,7 @@ class LiveView:
         }
 
     def _node_rows(self, now_s: float) -> list[dict[str, Any]]:
-        """State of each node."""
+        """State of each node; one that is silent has level 'error'."""
         rows = []
         for name, node in self._nodes.items():
             age_s = now_s - node.heard_s
@@ -306,7 +319,7 @@ class LiveView:
         return rows
 
     def _sensor_row(self, name: str) -> dict[str, Any]:
-        """State and residuals of a sensor."""
+        """State of a sensor, and its last 400 residuals (`MOST_POINTS`), mm."""
         report = self._reports.get(name)
         ages = self._recorder.read_age_s if self._recorder else {}
         norms = 1e3 * self.residuals.norms_m(name)
@@ -325,7 +338,7 @@ class LiveView:
         }
 
     def _precision_table(self) -> dict[str, Any]:
-        """Standard deviations of the offsets by configurations and minutes."""
+        """Standard deviations of the offsets, degrees, at the last 400 looks, with their times."""
         looks = self._precision.looks[-MOST_POINTS:]
         return {
             'message': _clip(self._precision.message),
@@ -338,7 +351,7 @@ class LiveView:
         }
 
     def _result(self) -> dict[str, Any]:
-        """Offsets and facts of the last fit."""
+        """Offsets and facts of the last fit; no joints before there is one."""
         return {
             'joints': [
                 self._offset_row(joint, name, *self._offsets[name])
@@ -349,7 +362,11 @@ class LiveView:
         }
 
     def _offset_row(self, joint: int, name: str, mean: float, std: float) -> dict[str, Any]:
-        """Offset of a joint and its standard deviation, None while it is undetermined."""
+        """Offset of a joint and its std, deg or mm; the std is None while it is undetermined.
+
+        ``joint``: index from 0; undetermined: not identifiable, or a std of 5 degrees
+        (`UNDETERMINED_RAD`, times ``per_radian``) or more.
+        """
         as_angle = std / float(self._chain.per_radian[joint])
         known = name not in self._fit.unidentifiable and as_angle < UNDETERMINED_RAD
         if self._chain.slides[joint]:
@@ -410,7 +427,7 @@ class LiveView:
         }
 
     def _scene(self) -> dict[str, Any]:
-        """Moving part of the 3-D view."""
+        """Moving part of the 3-D view: joints, target, path, sensors and measured points, in R."""
         q, target = self._q, self._target
         return {
             'q': None if q is None else _rounded(q, 6),
@@ -426,7 +443,11 @@ class LiveView:
 
 
 def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArray:
-    """Tool positions along straight lines between configurations (n, k), m, (m, 3)."""
+    """Tool positions along straight lines in joint space between configurations, in R, m, (m, 3).
+
+    ``way``: rad or m, (n, k); ``steps``: points of each line, with both ends. (0, 3) for fewer
+    than two configurations.
+    """
     if len(way) < 2:
         return np.empty((0, 3))
     share = np.linspace(0.0, 1.0, steps)[:, None]
@@ -435,7 +456,7 @@ def tool_path(chain: SerialChain, way: FloatArray, steps: int = 12) -> FloatArra
 
 
 def _clip(text: str, longest: int = LONGEST_TEXT) -> str:
-    """Text cut to a length."""
+    """Text cut to a number of characters, the last one then '…'."""
     return text if len(text) <= longest else f'{text[: longest - 1]}…'
 
 
@@ -445,9 +466,10 @@ def _as_sentence(text: str) -> str:
 
 
 def _degrees(radians: float) -> float:
+    """Angle in rad as degrees, to six decimals."""
     return round(float(np.degrees(radians)), 6)
 
 
 def _rounded(values: FloatArray | Sequence[float], digits: int) -> Any:
-    """Values as rounded lists."""
+    """Values as (nested) lists, rounded to a number of decimals."""
     return np.round(np.asarray(values, dtype=float), digits).tolist()

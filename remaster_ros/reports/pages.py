@@ -42,14 +42,21 @@ from remaster_ros.session.files import make_folder, write_atomically
 
 
 def law(effect: FoundEffect) -> str:
-    """Equation and source of an effect; for an effect without a name, those of its form."""
+    """Equation and source of an effect; '' if it has none.
+
+    For an effect without a name, those of its form: a step if it came at a moment.
+    """
     happened = effect.name == NO_NAME.name and effect.moment_s is not None
     kind = EFFECTS.get('step' if happened else effect.name)
     return '' if kind is None else f'{kind.equation} ({kind.source})'
 
 
 def page(template: str, **content: Any) -> str:
-    """Page from a template of this package, with all content escaped."""
+    """Text of a page from a template of this package, with all content escaped.
+
+    ``template``: its file name; ``content``: its variables. Raises jinja2.UndefinedError if one is
+    missing.
+    """
     environment = Environment(
         autoescape=True,
         undefined=StrictUndefined,
@@ -84,13 +91,13 @@ def page(template: str, **content: Any) -> str:
 
 
 def summarized(effect: Mapping[str, Any]) -> Markup:
-    """A cause with its size, for a list."""
+    """A cause with its size in brackets, as HTML; ``effect``: as discovery.json has it."""
     size = size_words(msgspec.convert(effect, FoundEffect))
     return Markup('{} <span class="soft">({})</span>').format(effect['cause'], size)
 
 
 def _template(name: str) -> str:
-    """Text of a template."""
+    """Text of a template of this package, by its file name."""
     return importlib.resources.files(__package__).joinpath(name).read_text(encoding='utf-8')
 
 
@@ -107,13 +114,16 @@ def inlined(name: str, svg: str) -> Markup:
 
 
 def compressed(text: str) -> str:
-    """Text compressed and in base64, for the pages to unpack."""
+    """Text gzip-compressed and in base64, for the pages to unpack; reproducible."""
     # The highest level takes twice as long, for a hundredth less.
     return base64.b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 
 
 def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
-    """Write report.html, and the figures as SVG files in ``figures``; returns its path."""
+    """Write report.html, and the figures as SVG files in ``figures``; return the page's path.
+
+    ``drawings``: SVG text by name. Raises DiskError if the folder cannot be written to.
+    """
     make_folder(folder / 'figures')
     for name, text in drawings.items():
         write_atomically(folder / 'figures' / f'{name}.svg', text)
@@ -122,12 +132,12 @@ def write_report(folder: Path, drawings: dict[str, str], html: str) -> Path:
 
 
 def _fixed(number: float | None, digits: int) -> str:
-    """Number with `digits` decimal places; a dash for None."""
+    """Number with a number of decimals and a typographic minus sign; a dash for None."""
     return '–' if number is None else _minus(f'{number:.{digits}f}')
 
 
 def _signed(number: float, digits: int) -> str:
-    """Number with its sign."""
+    """Number with its sign and a number of decimals; zero has none."""
     return _minus(f'{number:+.{digits}f}')
 
 

@@ -59,7 +59,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 
 
 def _separated(design: SeparatingDesign) -> dict[str, Any]:
-    """Configurations that separate causes, and by how much."""
+    """Configurations that separate causes, degrees, and how far apart these are, in stds."""
     return {
         'configurations': sum(len(pose.solutions) for pose in design.poses),
         'q_deg': [
@@ -79,12 +79,12 @@ def _separated(design: SeparatingDesign) -> dict[str, Any]:
 
 
 def _at_poses(configurations: int, poses: int) -> str:
-    """Numbers of configurations and poses as text."""
+    """Text such as '12 configurations at 3 poses'."""
     return f'{counted(configurations, "configuration")} at {counted(poses, "pose")}'
 
 
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
-    """A plan as text, one subject a line."""
+    """A plan as text, one subject a line: counts, time, expected precision, goal if missed."""
     visits = Counter(visit.split for visit in plan.visits)
     poses = plan.poses
     lines = [
@@ -114,7 +114,7 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
 
 
 def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
-    """A plan without paths, with the keys of `plan_to_dict`."""
+    """A plan without paths, with those keys of `plan_to_dict` that need none."""
     return {
         'configurations': sum(tour.configurations.values()),
         'poses': sum(tour.poses.values()),
@@ -130,7 +130,7 @@ def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
 
 
 def outlook_text(tour: Tour, expected: Expected) -> str:
-    """A plan without paths as text, one subject a line."""
+    """A plan without paths as text, one subject a line: counts and expected precision."""
     counts = {split: (tour.configurations[split], poses) for split, poses in tour.poses.items()}
     fitted, held_out = counts[FITTED], counts.get(HELD_OUT, (0, 0))
     lines = [
@@ -144,7 +144,10 @@ def outlook_text(tour: Tour, expected: Expected) -> str:
 def _expected_lines(
     chain: SerialChain, joint_std: Mapping[str, float | None], joint_rms: float, tool_rms: float
 ) -> list[str]:
-    """Expected standard deviations, a line each."""
+    """Expected standard deviations, a line each: of the offsets, their RMS, and of the markers.
+
+    ``joint_std``: rad or m, None if not identifiable; ``joint_rms``: rad; ``tool_rms``: m.
+    """
     lines = ['expected standard deviation of the offsets:']
     for joint, (name, std) in enumerate(joint_std.items()):
         value = 'not identifiable' if std is None else chain.shown_offset(joint, std, 4)
@@ -165,7 +168,10 @@ def slides_in_rms(chain: SerialChain) -> str:
 def _expected_std(
     joint_std: Mapping[str, float | None], chain: SerialChain
 ) -> dict[str, dict[str, float | None]]:
-    """Expected standard deviations in degrees, and in mm for prismatic joints."""
+    """Expected standard deviations in degrees, and in mm for prismatic joints, by joint.
+
+    ``joint_std``: rad or m, in joint order; None stays None.
+    """
     found: dict[str, dict[str, float | None]] = {'expected_std_deg': {}}
     if chain.slides.any():
         found['expected_std_mm'] = {}
@@ -175,7 +181,7 @@ def _expected_std(
 
 
 def _separated_text(design: SeparatingDesign) -> list[str]:
-    """Configurations that separate causes, in lines."""
+    """Configurations that separate causes, in lines: number, each pair and whether decided."""
     count = sum(len(pose.solutions) for pose in design.poses)
     lines = [f'of these to separate causes: {_at_poses(count, len(design.poses))}']
     for pair in design.pairs:
@@ -189,12 +195,15 @@ def _separated_text(design: SeparatingDesign) -> list[str]:
 
 
 def minutes_text(seconds: float) -> str:
-    """A time in minutes, as text."""
+    """Time, s, in minutes as text: '12.5 min'."""
     return f'{seconds / 60:.1f} min'
 
 
 def missed_goal(plan: CollectionPlan) -> str:
-    """Goal that an optimal design does not reach, with a remedy; '' if it does."""
+    """Sentence that an optimal design does not reach its goal, with a remedy.
+
+    '' if it does, or without such a design.
+    """
     if plan.design_result is None or plan.goal_reached:
         return ''
     return (
@@ -205,6 +214,6 @@ def missed_goal(plan: CollectionPlan) -> str:
 
 
 def _counts(counts: dict[str, int] | Counter[str]) -> str:
-    """Counts by reason, as text."""
+    """Counts by reason as text, the largest first: '3 a, 1 b'; 'none' without any."""
     ordered = Counter(counts).most_common()
     return ', '.join(f'{count} {reason}' for reason, count in ordered) or 'none'

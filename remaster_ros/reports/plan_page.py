@@ -105,7 +105,10 @@ def plan_page(
 
 
 def check_plan_page(path: Path) -> None:
-    """Raise InputError if a file exists and is no page of a plan."""
+    """Raise InputError if a file exists and is no page of a plan.
+
+    A page of a plan has the mark of `GENERATOR` in its first 2,000 bytes.
+    """
     if not path.exists():
         return
     if path.is_file():
@@ -157,7 +160,7 @@ def write_plan_page(path: Path, html: str) -> None:
 
 
 def _points(plan: CollectionPlan) -> list[str]:
-    """Warnings on a plan."""
+    """Warnings on a plan, sentences: goal missed, fit undetermined, unreached configurations."""
     points = [missed_goal(plan)]
     if plan.undetermined:
         points.append(f'A fit of these configurations states nothing: {plan.undetermined}')
@@ -167,7 +170,7 @@ def _points(plan: CollectionPlan) -> list[str]:
 
 
 def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
-    """Words and counts of each split."""
+    """Words and counts of each split that has visits, in the order of `WORDS`."""
     rows = []
     for split, (words, why) in WORDS.items():
         visits = [visit for visit in plan.visits if visit.split == split]
@@ -189,7 +192,7 @@ def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
-    """Expected std and range of each joint."""
+    """Expected std, range over the visits, and limits of each joint, deg or mm."""
     q = chain.shown_scale * np.array([visit.q for visit in plan.visits])
     return [
         {
@@ -205,7 +208,7 @@ def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
 
 
 def _limits(chain: SerialChain, joint: int) -> str:
-    """Limits of a joint as text."""
+    """Limits of a joint (index from 0) as text, degrees or mm; 'none' if one is infinite."""
     if not np.isfinite([chain.lower[joint], chain.upper[joint]]).all():
         return 'none'
     return chain.shown_limits(joint).replace('-', '\N{MINUS SIGN}')
@@ -234,4 +237,5 @@ def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
 
 
 def _rounded(q: Any) -> list[float]:
+    """Joint positions as a list, to five decimals."""
     return [round(float(angle), 5) for angle in q]

@@ -42,7 +42,10 @@ class Precision(Struct):
 
 
 def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
-    """JSON of at least one look, and of the stopping rule's result for the newest."""
+    """Text of JSON of at least one look, and of the stopping rule's result for the newest.
+
+    Units as of `Precision`; unknown values are null.
+    """
     last, goal = looks[-1], rule.goal
     found = Precision(
         goal={
@@ -86,5 +89,5 @@ def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
 
 
 def _scaled(value: float | None, factor: float) -> float | None:
-    """Value times a factor; None if unknown."""
+    """Value times a factor; None if it is None or not finite."""
     return None if value is None or not np.isfinite(value) else float(value * factor)

@@ -93,12 +93,12 @@ class View3D(NamedTuple):
 
     @property
     def data(self) -> str:
-        """The picture, compressed for the page."""
+        """The picture as JSON, compressed and in base64 for the page."""
         return compressed(json.dumps(self.picture, separators=(',', ':'), allow_nan=False))
 
     @property
     def code(self) -> str:
-        """The scripts, compressed for the page."""
+        """The scripts of the 3-D view, compressed and in base64 for the page."""
         return compressed(view_script('fit_page.js'))
 
 
@@ -164,7 +164,7 @@ def _rounded(points: FloatArray) -> Any:
 
 
 def _point_texts(result: FitResult, shown: IntArray) -> list[str]:
-    """Description of each point."""
+    """Description of each shown row (indices): numbers, sensor, errors before and after, mm."""
     m = result.session.measurements
     before, after = (
         lengths_mm(residuals[shown])
@@ -187,7 +187,10 @@ def _round_factor(factor: float) -> int:
 
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
-    """A row for each split and metric, with the reason if there is no number."""
+    """A row for each split and metric, with the reason if there is no number.
+
+    Validation first, if held out; metrics at random configurations once, with split 'any'.
+    """
     rows = []
     for split in ('validation', 'optimization'):
         metrics = getattr(accuracy, split)
@@ -245,7 +248,7 @@ def inputs_of(result: FitResult) -> Inputs:
 
 
 def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
-    """Page of a fit; with drawings (of `draw_fit`) also the 3-D view."""
+    """Page of a fit; with drawings (of `draw_fit`) also the 3-D view, without ({}) none."""
     scene: View3D | None = None
     if drawings:
         scene = draw_view(result)
@@ -273,7 +276,10 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
 
 
 def write_discovery_report(discovery: Discovery, content: Discovered, folder: Path) -> Path:
-    """Write report.html and the figures of a discovery to a folder; returns its path."""
+    """Write report.html and figures of a discovery to a folder, made if missing; return its path.
+
+    Raises DiskError if the folder cannot be written to.
+    """
     drawings = draw_discovery(discovery)
     html = discovery_html(content, discovery.fit.session, drawings)
     return write_report(folder, drawings, html)
@@ -339,7 +345,10 @@ class PlanFacts:
 
     @property
     def verdict(self) -> str:
-        """Sentence on expected and reached standard deviations; '' if unknown."""
+        """Sentence on expected and reached standard deviations; '' if unknown.
+
+        Within a factor of 1.5 (`AS_EXPECTED`) they agree.
+        """
         if self.ratio is None:
             return ''
         if self.ratio < 1.0 / AS_EXPECTED:
@@ -358,7 +367,7 @@ class PlanFacts:
 
 
 def plan_facts(inputs: Inputs) -> PlanFacts | None:
-    """Facts of the session's plan; None if it has none."""
+    """Facts of the session's plan for the page; None if it has none."""
     plan, session = inputs.plan, inputs.session
     if plan is None:
         return None
@@ -390,7 +399,7 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
 
 
 def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
-    """Planned and recorded configurations of a split."""
+    """Planned and recorded configurations of a split; ``words``: its name on the page."""
     poses = plan.tour.plans[split].poses
     ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
     recorded = sum(ends.pop(result, 0) for result in RECORDED)
@@ -402,7 +411,10 @@ def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
 
 
 def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
-    """Expected and reached standard deviation of each joint."""
+    """Expected and reached standard deviation of each joint's offset, deg or mm.
+
+    Those of the model alone, of an arm exactly as drawn. () if none were expected.
+    """
     if plan.expected is None:
         return ()
     expected = plan.expected.joint_std_rad
@@ -432,7 +444,10 @@ def drawn_plan(plan: RecordedPlan) -> bytes:
 
 
 def copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
-    """Copy the page of the plan to a folder, so that the report is complete."""
+    """Copy the page of the plan to a folder, so that the report is complete.
+
+    An earlier copy is removed, also if there is no plan.
+    """
     (folder / PLAN_FILE).unlink(missing_ok=True)
     if plan is not None and (html := drawn_plan(plan)):
         write_atomically(folder / PLAN_FILE, html)
@@ -564,7 +579,7 @@ def require_ready(folder: Path, pdf: bool) -> Any:
 
 
 def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = False) -> str:
-    """Page of a report."""
+    """Text of a report's page; ``drawings``: figures as HTML by name; ``printing``: for PDF."""
     inputs, answer = subject.inputs, subject.answer
     fit = msgspec.to_builtins(inputs.fit)
     found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
@@ -600,13 +615,16 @@ def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = 
 
 
 def _chain(inputs: Inputs) -> SerialChain:
-    """Chain of a session."""
+    """Chain of the session's arm."""
     session = inputs.session
     return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
-    """Further remarks on the fit, on the model with causes, and on the other session."""
+    """Further remarks on the fit, on the model with causes, and on the other session, a line each.
+
+    Findings that the causes answer, and disagreements that are listed elsewhere, are left out.
+    """
     judgement, found = inputs.judgement, inputs.found
     answered = judgement.findings if found is not None else []
     lines = [] if answer.uses_causes else judgement.points
@@ -617,7 +635,7 @@ def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
 
 
 def measured_when(inputs: Inputs) -> str:
-    """Date of the measurement, from the session or from its times."""
+    """Times of the first and the last reading (UTC); the session's date without clock times."""
     stamps = inputs.session.measurements.stamp_s
     if inputs.session.timed and (first := clock_time(float(stamps.min()))):
         last = clock_time(float(stamps.max()))
@@ -626,14 +644,14 @@ def measured_when(inputs: Inputs) -> str:
 
 
 def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
-    """Number of gross errors among the rows to fit, of the model that is used."""
+    """Number of gross errors among the rows to fit, of the model that the answer uses."""
     m = inputs.session.measurements
     left_out = inputs.gross if answer.uses_causes else list(inputs.fit_left_out)
     return int(np.sum(~m.is_validation & np.isin(m.observation, left_out)))
 
 
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
-    """Rows with the largest errors after the action, the largest first."""
+    """The 10 rows (`WORST_ROWS`) with the largest errors after the action, the largest first."""
     session, m = inputs.session, inputs.session.measurements
     final = answer.final_mm
     frames = inputs.T_R_N
@@ -668,7 +686,11 @@ def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
 def _copy_apply(
     source: Path, model: Path | None, compensation: Path | None, answer: Answer, folder: Path
 ) -> None:
-    """Copy the files of the action to the folder, so that the report is complete."""
+    """Copy the files of the action to the folder's ``apply``, so that the report is complete.
+
+    Those of an earlier report are removed first. ``source``: folder with the files; ``model``,
+    ``compensation``: paths, None without such a file. Raises InputError if one cannot be read.
+    """
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:
         # A file of an earlier page would contradict this one.
@@ -684,7 +706,10 @@ def _copy_apply(
 
 
 def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Figures of a fit or a discovery in a folder, of those that exist."""
+    """Texts of those figures (SVG) of a fit or a discovery in a folder that exist, by name.
+
+    Raises InputError if one has more than a drawing.
+    """
     texts = {}
     for name in names:
         path = folder / 'figures' / f'{name}.svg'
@@ -702,7 +727,10 @@ SVG_ELEMENTS = {
 
 
 def checked_svg(text: str, path: Path) -> str:
-    """Text of a figure. Raises InputError if it has more than a drawing."""
+    """Text of a figure, unchanged. Raises InputError if it has more than a drawing.
+
+    More: scripts, links or styles that load something, or elements not in `SVG_ELEMENTS`.
+    """
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError:
@@ -726,7 +754,7 @@ def as_image(svg: str) -> Markup:
 
 
 def _pdf_library() -> Any:
-    """Library for PDF. Raises InputError, with the way to install it, if it is missing."""
+    """Module of WeasyPrint. Raises InputError, with the way to install it, if it is missing."""
     try:
         import weasyprint
     except ImportError:

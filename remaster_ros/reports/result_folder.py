@@ -75,7 +75,7 @@ def prepare_folder(folder: str | os.PathLike[str], result: str) -> None:
 
 
 def _remove_report(folder: Path) -> None:
-    """Remove the report of an earlier run, which would contradict the new result."""
+    """Remove report.html of an earlier run, if any, which would contradict the new result."""
     with writing(folder / REPORT_FILE):
         (folder / REPORT_FILE).unlink(missing_ok=True)
 
@@ -164,9 +164,10 @@ def save_discovery(
 
 
 def _write_applied(folder: Path, files: Mapping[str, str | bytes]) -> None:
-    """Write the files to apply.
+    """Write the files to apply into the folder's ``apply``, by name.
 
-    Last result: remove models of an earlier run, which would contradict them.
+    Robot model and compensation.json of an earlier run, which would contradict them, are removed
+    first. Raises DiskError if the folder cannot be written to.
     """
     make_folder(folder / APPLY_FOLDER)
     for name in (MODEL_FILE, COMPENSATION_FILE):

@@ -73,7 +73,7 @@ class RobotScene:
         return np.concatenate((base, frames), axis=-3)
 
     def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
-        """Scene with sensors at their measured poses, (4, 4) each."""
+        """Scene with sensors at their measured poses T_R_N, (4, 4) each; others are unchanged."""
         sights = [
             replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
             for sight in self.sights
@@ -142,7 +142,7 @@ def _notes(missing: Sequence[str]) -> list[str]:
 
 
 def _drawn(visual: Visual, mesh_parts: MeshParts) -> list[Surface]:
-    """Surfaces of a visual element; [] if it cannot be drawn."""
+    """Surfaces of a visual element, in its link's frame; [] if its mesh cannot be read."""
     if visual.shape is not None:
         points, faces = _hull(visual.shape)
         parts = [MeshPart(points, faces, None)]
@@ -191,7 +191,10 @@ def coarser(
 
 
 def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[FloatArray, IntArray]:
-    """Mesh with the vertices of each cell of a grid merged."""
+    """Mesh with the vertices of each cell (edge in m) of a grid merged to their mean.
+
+    Triangles that lose a corner, and repeated ones, are dropped.
+    """
     steps = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     _, index = np.unique(_numbered(steps), return_inverse=True)
     counts = np.bincount(index)
@@ -205,19 +208,22 @@ def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[Floa
 
 
 def _numbered(rows: IntArray) -> IntArray:
-    """A number for each different row of three numbers from 0 on, (n,)."""
+    """A number for each different row of three numbers from 0 on, (n, 3) to (n,)."""
     size = rows.max(axis=0, initial=0) + 1
     return (rows[:, 0] * size[1] + rows[:, 1]) * size[2] + rows[:, 2]
 
 
 def _used(points: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Points that occur in triangles, and the triangles with the new indices."""
+    """Points that occur in triangles, (n, 3), and the triangles with the new indices, (m, 3)."""
     used, renumbered = np.unique(faces, return_inverse=True)
     return points[used], renumbered.reshape(-1, 3).astype(np.int64)
 
 
 def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
-    """Surface of a convex shape in its own frame."""
+    """Surface of a convex shape in its own frame: vertices, m, (n, 3), and triangles, (m, 3).
+
+    Triangles are vertex indices, counter-clockwise seen from outside.
+    """
     points = shape.outline
     if shape.ball > 0.0:
         # Its outline encloses it with few points; this is the shape itself, rounder.
@@ -228,7 +234,7 @@ def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
 
 @cache
 def _ball() -> FloatArray:
-    """Points spread evenly over the unit sphere, (n, 3), along a spiral."""
+    """200 points spread evenly over the unit sphere, (200, 3), along a spiral."""
     count = 200
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     turn = np.arange(count) * np.pi * (3.0 - 5.0**0.5)
@@ -280,7 +286,7 @@ def _limit(angle: float) -> float | None:
 
 
 def _surface(surface: Surface) -> dict[str, Any]:
-    """Surface in the form that robot_view.js takes."""
+    """Surface in the form that robot_view.js takes; see `scene_to_dict`."""
     low = surface.vertices.min(axis=0)
     step = np.maximum(np.ptp(surface.vertices, axis=0) / 65535.0, 1e-12)
     large = len(surface.vertices) > 65535
@@ -298,7 +304,7 @@ def _surface(surface: Surface) -> dict[str, Any]:
 
 
 def _base64(values: Any, kind: str) -> str:
-    """Values as numbers of a type, in base64."""
+    """Values as numbers of a type such as '<u2' (little-endian, 16 bits), in base64."""
     return base64.b64encode(np.asarray(values).astype(kind).tobytes()).decode()
 
 
@@ -326,7 +332,10 @@ _REMEDY = 'install trimesh as constraints.txt has it'
 
 
 def view_script(*names: str) -> str:
-    """three.js, robot_view.js and the named scripts of this package as one script."""
+    """three.js, robot_view.js and the named scripts of this package as one script.
+
+    Raises InputError if three.js is not there.
+    """
     ours = importlib.resources.files(__package__)
     texts = [ours.joinpath(name).read_text(encoding='utf-8') for name in ('robot_view.js', *names)]
     return '\n'.join([three_js(), *texts])

@@ -40,7 +40,10 @@ PREDICTION_COLUMNS = (
 
 
 def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Text of a file: identity of each row of the session, then the given columns."""
+    """Text of a CSV file: identity (`IDENTITY`) of each row of the session, then columns.
+
+    ``rows``: values of the columns, in the order of the measurements.
+    """
     m = session.measurements
     text = io.StringIO()
     writer = csv.writer(text, lineterminator='\n')

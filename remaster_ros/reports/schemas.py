@@ -189,7 +189,7 @@ class Imitation(Struct):
 
     @property
     def as_angle(self) -> float:
-        """Change as an angle, rad; a length by the angle that it counts as."""
+        """Change as an angle, rad; a length over `LEVER_M`, 0.25 m."""
         if self.deg is not None:
             return math.radians(self.deg)
         assert self.mm is not UNSET
@@ -197,7 +197,7 @@ class Imitation(Struct):
 
     @property
     def shown(self) -> str:
-        """Change with its unit, as text."""
+        """Change with its unit, to three decimals: '0.012 deg'."""
         return f'{self.mm:.3f} mm' if self.deg is None else f'{self.deg:.3f} deg'
 
 

@@ -72,7 +72,7 @@ MOST_PARAMETERS = 8
 
 
 def hardly_proven(held_out_poses: int) -> str:
-    """Sentence that few poses were held out; '' if none or enough were."""
+    """Sentence that fewer than 3 poses were held out (`FEWEST_HELD_OUT`); '' if none or enough."""
     if not 0 < held_out_poses < FEWEST_HELD_OUT:
         return ''
     return (
@@ -99,7 +99,10 @@ def times_smaller(before: float, after: float) -> str:
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
-    """Number of rounds of the references, and sentences on changes during the session."""
+    """Number of rounds of the references, and sentences on changes during the session.
+
+    (0, []) without references.
+    """
     if result.session.references is None:
         return 0, []
     # What judges them plans as well; few sessions have any.
@@ -110,7 +113,11 @@ def references(result: FitResult) -> tuple[int, list[str]]:
 
 
 def verdict(result: FitResult) -> Judgement:
-    """Judgement of a fit: gain, convergence, and offsets that are not identifiable."""
+    """Judgement of a fit: gain, convergence, and offsets that are not identifiable.
+
+    'bad' if chains disagree, the error grows by over a tenth or offsets are implausible; 'good' if
+    held-out poses show a gain of a tenth, noise explains the rest and nothing disagrees.
+    """
     validated = result.accuracy['validation'] is not None
     before, after = _mean_errors_mm(result, validated)
     gain = before / max(after, 1e-9)
@@ -238,7 +245,10 @@ def _sampling(sampler: SamplerInfo) -> str:
 
 
 def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
-    """Mean 3-D error before and after, mm, of the judged rows without gross errors."""
+    """Mean 3-D error before and after, mm, of held-out rows without gross errors.
+
+    If nothing was held out (``validated`` false), of the fitted rows.
+    """
     gross = [row for check in result.noise_checks for row in check.gross]
     if not (validated and gross):
         split = 'validation' if validated else 'optimization'
@@ -251,14 +261,14 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
 
 
 def _structure(result: FitResult) -> list[str]:
-    """Sentences on the drivers that the residuals follow."""
+    """Sentences on the drivers that the residuals follow, each with its probability by chance."""
     found = result.structure.found if result.structure is not None else ()
     tests = [(test.words(result.session.timed), test.chance) for test in found]
     return [f'{words[0].upper()}{words[1:]} ({chance}).' for words, chance in tests]
 
 
 def _widening(result: FitResult) -> list[str]:
-    """Sentences on the effect of unmodelled errors on the intervals."""
+    """Sentences on the effect of unmodelled errors on the intervals; [] without such errors."""
     lines = []
     if np.any(result.widening > 1.0):
         lines.append(
@@ -277,12 +287,15 @@ SEARCH = 'run "remaster discover"'
 
 
 def without_search(headline: str) -> str:
-    """Headline of a fit without the advice to search for causes."""
+    """Headline of a fit without the advice '; run "remaster discover"'."""
     return headline.replace(f'; {SEARCH}', '')
 
 
 def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
-    """Reason why the error after is no success, and the next step."""
+    """Sentence why the error after is no success, and the next step.
+
+    ``unexplained``: checks of the sensors whose error noise does not explain.
+    """
     if not result.other_errors:
         return 'Whether noise explains what is left, this session cannot show.'
     if result.structure is not None and result.structure.too_few:
@@ -298,7 +311,10 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
 
 
 def _compared(check: NoiseCheck) -> str:
-    """Error and noise of a sensor whose error noise does not explain, as a sentence."""
+    """Error and noise of a sensor as a sentence, for an error that noise does not explain.
+
+    Or for one of which the noise is unknown, with what to measure.
+    """
     if check.is_of_no_instrument:
         return check.no_instrument
     if check.noise_m is None:
@@ -378,7 +394,11 @@ def judgement(
 
 
 def more_than_noise(content: Discovered) -> str:
-    """Sentence that held-out rows show an error that the model does not have; '' if not."""
+    """Sentence that held-out rows show an error that the model does not have; '' if not.
+
+    Below 92 % of them surely in their regions (`FEWEST_INSIDE`), or an RMS error above 1.25 times
+    the noise (`MOST_OVER_NOISE`), plus 1 / √rows.
+    """
     left = 'something is left that the model does not have.'
     if isinstance(content.session, Struct) and content.session.validation.poses < FEWEST_HELD_OUT:
         # The rows of a pose share its error, which may be large by chance.
@@ -401,7 +421,11 @@ def more_than_noise(content: Discovered) -> str:
 
 
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
-    """Whether held-out poses, and the other session if there is one, agree with the verdict."""
+    """Whether held-out poses, and the other session if there is one, agree with the verdict.
+
+    False without held-out poses, for causes that are not certain or came at a moment, and if the
+    sampling has not converged.
+    """
     if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
     if not discovery.fit.sampler.converged:
@@ -436,13 +460,13 @@ def least_seen_m(discovery: Discovery) -> float:
 
 
 def _spoilt(discovery: Discovery) -> bool:
-    """Whether gross errors make up much of the error on held-out poses."""
+    """Whether gross errors make the error on held-out poses over 1.5 times larger (`SPOILT`)."""
     every, kept = discovery.gain.held_out_rms_after_m, discovery.gain.held_out_kept_after_m
     return every is not None and kept is not None and every > SPOILT * kept
 
 
 def _gross(discovery: Discovery) -> str:
-    """Sentence on the number of gross errors; '' if there are none."""
+    """Sentence on the number of gross errors, with a leading blank; '' if there are none."""
     count, of = len(discovery.outliers), len(discovery.residuals.context.measurements)
     if not count:
         return ''
@@ -453,12 +477,15 @@ def _gross(discovery: Discovery) -> str:
 
 
 def _would_show(discovery: Discovery) -> bool:
-    """Whether a cause that matters compared with the noise would have been found."""
+    """Whether a cause of half the noise (`MOST_UNSEEN`) at the marker would have been found."""
     return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
 
 
 def _uncertain(discovery: Discovery) -> str:
-    """Sentence on causes that are not certain, with their probabilities; '' if there are none."""
+    """Sentence on causes that are not certain, with their probabilities and a leading blank.
+
+    '' if there are none.
+    """
     names = [
         f'{sentence_case(effect.title)} (probability {probability_text(effect.probability)})'
         for effect in discovery.effects
@@ -470,7 +497,10 @@ def _uncertain(discovery: Discovery) -> str:
 def headline(
     discovery: Discovery, confirmation: Confirmation | None = None, more: str = ''
 ) -> str:
-    """Result in one or a few sentences; `more` is a finding on held-out rows."""
+    """Result of a discovery in one or a few sentences.
+
+    ``confirmation``: by another session; ``more``: finding on held-out rows, of `more_than_noise`.
+    """
     result = _result(
         discovery, confirmation, something_left=bool(more) or bool(discovery.outliers)
     )
@@ -480,7 +510,10 @@ def headline(
 def _result(
     discovery: Discovery, confirmation: Confirmation | None, *, something_left: bool
 ) -> str:
-    """Sentence on the verdict and the errors on held-out poses."""
+    """Sentences on the verdict and the errors on held-out poses.
+
+    ``something_left``: whether gross errors or more than noise are left.
+    """
     gain = discovery.gain
     change = ''
     if words := _held_out(gain):
@@ -542,7 +575,7 @@ def _result(
 
 
 def _held_out(gain: Gain) -> str:
-    """Errors on held-out poses in words; '' without such poses."""
+    """RMS errors on held-out poses before and after, and the noise, in words; '' without any."""
     before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     if before is None or after is None or gain.held_out_rms_after_m is None:
         return ''
@@ -576,12 +609,15 @@ def counts_words(session: MeasuredSession) -> str:
 
 
 def at_marker(size_m: float) -> str:
-    """Size of an error, as text."""
+    """Size of an error, m, as text: '0.123 mm RMS at the marker'."""
     return f'{1e3 * size_m:.3f} mm RMS at the marker'
 
 
 def size_words(effect: FoundEffect) -> str:
-    """Size of a cause, and the loss without it; '' in files of other programs."""
+    """Size of a cause, and the share of the gain that is lost without it, as text.
+
+    '' in files of other programs, which have no size.
+    """
     if np.isnan(effect.size_m):
         return ''
     if effect.share is None:
@@ -591,13 +627,13 @@ def size_words(effect: FoundEffect) -> str:
 
 
 def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
-    """Name of a look-alike of a cause."""
+    """Name of a look-alike of a cause, as text; one of its parts is named as such."""
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
 
 def _of_probability(other: LookAlike) -> str:
-    """Probability of a look-alike in brackets; '' if unknown."""
+    """Probability of a look-alike as ' (probability 12 %)'; '' if unknown."""
     if other.probability is None:
         return ''
     return f' (probability {probability_text(other.probability)})'
@@ -641,7 +677,7 @@ def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
 
 
 def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
-    """Results of a fit that a robot can load, as for a discovery."""
+    """Results of a fit that a robot can load: zero-offsets alone, then the robot model."""
     return [
         Loadable(
             'offsets', geometry.drawing_held_out_mean_mm, True, f'{APPLY_FOLDER}/{URDF_FILE}'
@@ -651,7 +687,7 @@ def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
 
 
 def load_words(row: Loadable) -> tuple[str, str]:
-    """Name of a result, and what to do with it."""
+    """Name of a loadable result, and its file or why to leave it, as text."""
     file = f'{row.file}{_MORE.get(row.result, "")}'
     worse = row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better
     if worse and row.result == 'everything' and row.file:
@@ -683,7 +719,7 @@ _MORE = {
 
 
 def fit_lines(fit: Fit) -> list[str]:
-    """Offsets, errors and verdict of a fit, a line each."""
+    """Offsets, errors and verdict of a fit, a line each; the fit has to have a judgement."""
     assert isinstance(fit.judgement, Judgement)
     width = max(len(row.joint) for row in fit.joint_offsets)
     lines = [f'{row.joint:{width}s} {_offset(row)}' for row in fit.joint_offsets]
@@ -716,7 +752,7 @@ def fit_lines(fit: Fit) -> list[str]:
 
 
 def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
-    """Return how late the stamps of each sensor are, and what to do, a line each."""
+    """Lines on how late the stamps of each sensor are, and what to do; [] without clocks."""
     if not isinstance(clocks, dict):
         return []
     return [
@@ -728,7 +764,7 @@ def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
 
 
 def _offset(row: JointOffset) -> str:
-    """Offset of a joint, as text."""
+    """Offset of a joint ± its std as text, or why it is not identifiable."""
     if not row.identifiable:
         return f'   not identifiable: {in_a_line(row.why)}'
     mean, std, drawn = (
@@ -739,7 +775,10 @@ def _offset(row: JointOffset) -> str:
 
 
 def _to_load(rows: Sequence[Loadable], effects: Sequence[FoundEffect] = ()) -> list[str]:
-    """Results that can be loaded, a line each."""
+    """Lines on the results that can be loaded: name, error on held-out poses, file.
+
+    ``effects``: causes, of which measuring errors that were taken out are mentioned.
+    """
     lines = []
     for row in rows:
         what, to_do = load_words(row)
@@ -789,7 +828,10 @@ def discovery_lines(found: Discovered) -> list[str]:
 
 
 def _side_by_side(found: Discovered, confirmation: Confirmation) -> list[str]:
-    """Table of the zero-offsets and the causes' parameters in both sessions."""
+    """Table, in lines, of the zero-offsets and the causes' parameters in both sessions.
+
+    One line for a cause of more than 8 parameters (`MOST_PARAMETERS`); [] without any.
+    """
     tables = [('zero-offsets', confirmation.joint_offsets)]
     tables += [
         (effect.title, cause.parameters)
