@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from worlds.dynamic_fakes import SteppedWorld
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
@@ -11,16 +12,7 @@ from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
-from remaster_ros.simulation.world import World, WorldContent
-
-
-class SteppedWorld(World):
-    """A World whose time the test sets."""
-
-    time_s = 100.0
-
-    def now(self):
-        return self.time_s
+from remaster_ros.simulation.world import WorldContent
 
 
 @pytest.fixture
@@ -114,7 +106,7 @@ def test_an_empty_trajectory_is_no_way_to_stop_it(world, arm):
 def test_another_process_sees_the_same_arm(world, arm):
     """A second World on the same folder computes the same marker at the same time."""
     go(arm, np.linspace(-0.4, 0.4, 7))
-    other = World.open(world.folder)
+    other = SteppedWorld.open(world.folder)
     go(arm, np.linspace(0.2, -0.2, 7))
     for t in (100.5, 101.0, 103.0):
         np.testing.assert_array_equal(
