@@ -66,7 +66,10 @@ class Function:
         return len(self.knots) - self.degree - 1 if self.form == 'bspline' else 1
 
     def features(self, values: FloatArray) -> FloatArray:
-        """Contribution of each coefficient per unit, (n, m), at values of the driver, (n,)."""
+        """Contribution of each coefficient per unit, (n, m), at values of the driver, (n,).
+
+        Splines wrap the values into their turn and hold the value of their ends beyond these.
+        """
         if self.form == 'bspline':
             inside = np.clip(self._in_turn(values), *self.ends)
             found = scipy.interpolate.BSpline.design_matrix(inside, self.knots, self.degree)
@@ -81,7 +84,7 @@ class Function:
         return np.asarray(wave(self.order * values))[:, None]
 
     def outside(self, values: FloatArray) -> BoolArray:
-        """Mask of the values beyond the ends of the splines, (n,)."""
+        """Mask of the values beyond the ends of the splines, (n,); all False for other forms."""
         if self.form != 'bspline':
             return np.zeros(len(values), dtype=bool)
         low, high = self.ends
@@ -95,7 +98,7 @@ class Function:
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
     def _in_turn(self, values: FloatArray) -> FloatArray:
-        """Values wrapped into the turn that begins at `turn_start`."""
+        """Values wrapped into the turn that begins at `turn_start`; unchanged if that is NaN."""
         if np.isnan(self.turn_start):
             return values
         found: FloatArray = self.turn_start + np.mod(values - self.turn_start, TURN)
@@ -134,7 +137,7 @@ class Geometry:
 
     @classmethod
     def none(cls, joints: int) -> Geometry:
-        """Geometry without a change."""
+        """Geometry of an arm of this number of joints without a change."""
         return cls(np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3)))
 
     @property
@@ -156,7 +159,10 @@ class Drivers:
     moment: FloatArray
 
     def of(self, function: Function) -> FloatArray:
-        """Value of the driver of a function, (n,)."""
+        """Value of the driver of a function, (n,).
+
+        0 for the driver 'none' and for 'gravity_moment', which has three values (`base_moment`).
+        """
         if function.driver == 'angle':
             return self.q[:, function.joint]
         if function.driver == 'gravity_torque':
@@ -240,14 +246,20 @@ class ArmModel:
         return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
 
     def warming(self, rows: int, temperature_c: FloatArray | float | None) -> FloatArray:
-        """Temperature above the reference, K, (rows,); of `mean_c` if `temperature_c` is None."""
+        """Temperature above the reference, K, (rows,); of `mean_c` if ``temperature_c`` is None.
+
+        ``temperature_c``: °C, one number or (rows,). Zeros if nothing depends on the temperature.
+        """
         if not self.grows:
             return np.zeros(rows)
         given = self.mean_c if temperature_c is None else np.asarray(temperature_c, dtype=float)
         return np.broadcast_to(given - self.reference_c, (rows,))
 
     def drivers(self, q: FloatArray, warming: FloatArray) -> Drivers:
-        """Values of the drivers at reported angles (n, k)."""
+        """Values of the drivers at reported angles (n, k); torques are nominal ones at q + δ.
+
+        ``warming``: temperature above the reference, K, (n,).
+        """
         n, k = q.shape
         torque, base, moment = np.zeros((n, k)), np.zeros((n, 3)), np.zeros((n, k, 3))
         if self._needs & {'gravity_torque', 'gravity_moment', 'lateral'}:
@@ -265,7 +277,7 @@ class ArmModel:
         return Drivers(q, warming, torque, base, moment)
 
     def added_angles(self, drivers: Drivers) -> FloatArray:
-        """Sum of offsets and terms, to be added to the reported angles, rad, (n, k)."""
+        """Sum of zero-offsets and terms, to be added to the reported angles, rad or m, (n, k)."""
         added = np.tile(self.joint_offsets, (len(drivers.q), 1))
         for term in self.joint_terms:
             values = term.function.features(drivers.of(term.function))
@@ -273,16 +285,16 @@ class ArmModel:
         return added
 
     def sampled_angles(self) -> FloatArray:
-        """Uniform random angles within the limits, rad, (n, k), equal in each call."""
+        """Uniform random configurations within the limits, rad or m, (500, k), always the same."""
         low, high = self.chain.usual_range
         return np.random.default_rng(0).uniform(low, high, (SAMPLED_ROWS, self.joints))
 
     def largest_slope(self) -> float:
         """Largest slope of offsets and terms over the reported angles.
 
-        Largest sum of the changes of one joint, rad per rad, at sampled angles; a prismatic joint
-        counts by `SerialChain.per_radian`. Below 1 there is one command for each wanted angle, to
-        which the fixed-point iteration converges (Banach).
+        Largest sum of the changes of one joint, rad per rad, at 500 sampled configurations; a
+        prismatic joint counts by `SerialChain.per_radian`. Below 1 there is one command for each
+        wanted angle, to which the fixed-point iteration converges (Banach).
         """
         k, warming, unit = self.joints, np.zeros(SAMPLED_ROWS), self.chain.per_radian
         q = self.sampled_angles()
@@ -295,7 +307,10 @@ class ArmModel:
         return float(slopes.max())
 
     def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
-        """State of the arm at reported angles (n, k)."""
+        """State of the arm at reported angles (n, k).
+
+        ``temperature_c``: °C, one number or (n,); None for that of the measurements.
+        """
         return self._state(self.drivers(q, self.warming(len(q), temperature_c)))
 
     def rigid(self) -> SerialChain:
@@ -339,7 +354,7 @@ class ArmModel:
         return transform(rotation, drawn[:, :3, 3] + shifts)
 
     def _base_turn(self, drivers: Drivers) -> FloatArray:
-        """Rotation vector of the base, rad, (n, 3)."""
+        """Rotation vector of the base by all base terms, rad, (n, 3), about the axes of R."""
         turn = np.zeros((len(drivers.q), 3))
         for term in self.base_terms:
             turn += self._base_features(drivers, term) * term.coefficients
@@ -353,14 +368,20 @@ class ArmModel:
         return np.repeat(term.function.features(drivers.of(term.function)), 3, axis=1)
 
     def _lateral(self, drivers: Drivers, frame: FloatArray, joint: int) -> FloatArray:
-        """Gravity's moment on a link across its joint's axis, N m, (n, 3)."""
+        """Gravity's moment on a link across its joint's axis, N m, (n, 3), in R.
+
+        ``frame``: of the joint in R, (n, 4, 4); ``joint``: index from 0.
+        """
         axis = frame[:, :3, :3] @ self.chain.axes[joint]
         moment = drivers.moment[:, joint]
         lateral: FloatArray = moment - np.sum(moment * axis, axis=1)[:, None] * axis
         return lateral
 
     def outside(self, q: FloatArray) -> BoolArray:
-        """Mask of the rows beyond the range of a measured curve, (n,)."""
+        """Mask of the rows beyond a measured curve's range, (n,), temperature not considered.
+
+        ``q``: reported angles, rad or m, (n, k).
+        """
         drivers = self.drivers(q, np.zeros(len(q)))
         found = np.zeros(len(q), dtype=bool)
         for term in self.joint_terms:
@@ -389,18 +410,21 @@ class ArmModel:
         return tuple(names)
 
     def registration(self, sensor: str) -> tuple[slice, slice]:
-        """Slices of the shift and the rotation of a registration in the parameters."""
+        """Slices of the shift and the rotation of a sensor's registration in the parameters.
+
+        Raises ValueError for an unknown sensor.
+        """
         start = self.joints + 6 * list(self.T_R_N).index(sensor)
         return slice(start, start + 3), slice(start + 3, start + 6)
 
     def marker(self, marker: str) -> slice:
-        """Slice of a marker's position in the parameters."""
+        """Slice of a marker's position in the parameters; ValueError for an unknown name."""
         start = self.joints + 6 * len(self.T_R_N) + 3 * list(self.markers).index(marker)
         return slice(start, start + 3)
 
     @cached_property
     def parameter_units(self) -> tuple[str, ...]:
-        """Units of the parameters."""
+        """Units of the parameters, in the order of `parameter_names`."""
         chain, units = (
             self.chain,
             {
@@ -443,7 +467,10 @@ class ArmModel:
         return np.concatenate(parts)
 
     def with_step(self, step: FloatArray) -> ArmModel:
-        """Model with a step (p,) added to its parameters."""
+        """Model with a step (p,), in the order of `parameter_names`, added to its parameters.
+
+        Registrations are moved by it in R: T_R_N becomes step T_R_N.
+        """
         k, at = self.joints, 0
 
         def take(count: int) -> FloatArray:
@@ -480,9 +507,10 @@ class ArmModel:
         )
 
     def derivative(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Derivative of a marker's position by the parameters, (n, 3, p).
+        """Derivative of a marker's position by the parameters, (n, 3, p), m per unit.
 
-        The position is in R as the registration of `sensor` has it.
+        The position is in R as the registration of ``sensor`` has it: a shift of the sensor counts
+        as the opposite shift of the arm.
         """
         n, k, drivers = len(state.angles), self.joints, state.drivers
         points = apply(state.tool, self.markers[marker])
@@ -519,6 +547,7 @@ class ArmModel:
         return np.concatenate(parts, axis=2)
 
     def _base_frame(self, drivers: Drivers) -> FloatArray:
+        """Pose of the base with its turn, (n, 4, 4), in R."""
         return transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
 
     def in_sensor(self, state: State, sensor: str, marker: str) -> FloatArray:
@@ -531,9 +560,10 @@ _UNITS = {'gravity_moment': '(N m)', 'temperature': 'K'}
 
 
 def unit_of(function: Function, chain: SerialChain, unit_of_sum: str = 'rad') -> str:
-    """Unit of a function's coefficients.
+    """Unit of a function's coefficients, such as 'rad/(N m)' or 'rad/K'.
 
-    ``unit_of_sum``: unit of the quantity to which they add.
+    ``unit_of_sum``: unit of the quantity to which they add, and of all but linear and quadratic
+    functions.
     """
     if function.form not in ('linear', 'quadratic'):
         return unit_of_sum

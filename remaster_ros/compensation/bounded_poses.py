@@ -106,7 +106,8 @@ def box_minimum(
     """Minimum of x'Hx / 2 - l'x of each row within bounds, (n, k).
 
     ``hessian``: H, positive definite, (n, k, k); ``linear``: l, (n, k); ``start``: within the
-    bounds, (n, k); ``bounds``: least and largest x, (n, k) each.
+    bounds, (n, k); ``bounds``: least and largest x, (n, k) each. A row that needs more than 8 k
+    changes of the active set keeps its last value, within the bounds.
     """
     low, high = bounds
     k = linear.shape[1]

@@ -39,7 +39,7 @@ class CheckVisits:
     detectable_m: FloatArray
 
     def table(self) -> str:
-        """Text of the table, in degrees, mm for prismatic joints."""
+        """CSV text of the table with a header, in degrees (sliding: mm), 6 decimals."""
         lines = [','.join(columns_of(self.chain))]
         shown = self.chain.shown_scale * self.q
         lines += [','.join(f'{value:.6f}' for value in row) for row in shown]
@@ -51,7 +51,7 @@ class CheckVisits:
         return ways + len(self.q) * travel.measuring_s
 
     def too_long(self, seconds: float) -> str:
-        """Remedy if a check takes too long; '' if it does not."""
+        """Remedy if a check takes over 90 s (`CHECK_S`), a clause; '' if it does not."""
         if seconds <= CHECK_S:
             return ''
         return (
@@ -60,7 +60,7 @@ class CheckVisits:
         )
 
     def expected(self) -> list[str]:
-        """Smallest change of each joint that one check finds, a line each."""
+        """Smallest change of each joint that one check finds, mm at the tool, a line each."""
         return [
             f'{name}: '
             + ('none: looks like a sensor that was moved' if np.isnan(m) else f'{1e3 * m:.2f} mm')
@@ -101,7 +101,7 @@ def chosen_visits(
 
 
 def columns_of(chain: SerialChain) -> list[str]:
-    """Header of a table of configurations."""
+    """Header of a table of configurations: 'joint_1 [deg]', 'rail [mm]', …"""
     names = zip(chain.joint_names, chain.shown_units, strict=True)
     return [f'{name} [{unit}]' for name, unit in names]
 

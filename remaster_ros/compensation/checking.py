@@ -80,7 +80,7 @@ class Measured:
     when_s: float = np.nan  # Unix time of the check, s; NaN if unknown
 
     def merged(self, chain: SerialChain) -> Measured:
-        """Mean of the readings of each pose, by sensor and marker."""
+        """Mean reading of each pose, by sensor and marker, in order of first reading."""
         rows: list[int] = []
         for row in range(len(self.q)):
             same = [
@@ -122,7 +122,10 @@ class Measured:
 
 
 def is_same_pose(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolArray:
-    """Mask of the configurations (n, k) that belong to the pose of one configuration, (n,)."""
+    """Mask of the configurations (n, k) that belong to the pose of one configuration (k,), (n,).
+
+    All joints within 0.5 degrees (`SAME_RAD`), for a slide that times ``per_radian``.
+    """
     difference: FloatArray = np.abs(q - place) / chain.per_radian
     return np.asarray(difference.max(axis=1) <= SAME_RAD)
 
@@ -146,7 +149,8 @@ class CheckResiduals:
 def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
     """Residuals of a check against the correction's model, with the sensors registered again.
 
-    Raises InsufficientDataError if there are too few poses to register the sensors.
+    Raises InsufficientDataError if there are too few poses to register the sensors, or fewer
+    numbers are left than joints.
     """
     n, k = measured.q.shape
     state = model.state(measured.q)
@@ -193,7 +197,10 @@ def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
 
 
 def rigid_motions(points: FloatArray) -> FloatArray:
-    """Displacements of points (n, 3) by unit shifts and rotations of a sensor, (n, 3, 6)."""
+    """Displacements of points (n, 3) by unit shifts and rotations of a sensor, (n, 3, 6).
+
+    Columns: shifts along x, y, z, then rotations about them, at the origin.
+    """
     turns = np.cross(np.eye(3), points[:, None, :]).swapaxes(1, 2)
     shifts = np.broadcast_to(np.eye(3), turns.shape)
     return np.concatenate((shifts, turns), axis=2)
@@ -202,7 +209,9 @@ def rigid_motions(points: FloatArray) -> FloatArray:
 def detectable_m(joints: FloatArray, lever_m: FloatArray, noise_m: float) -> FloatArray:
     """Smallest change of each joint that one check finds, m at the tool, (k,).
 
-    NaN if a moved sensor has the same effect.
+    Found in 95 % of cases at 1 % of false alarms (`POWER_STD`). NaN if a moved sensor has the same
+    effect. ``joints``: effects, (3 n, k); ``lever_m``: as in `CheckResiduals`; ``noise_m``: per
+    axis.
     """
     information = np.sum(joints**2, axis=0)
     is_seen = _is_seen(joints, lever_m)
@@ -212,7 +221,10 @@ def detectable_m(joints: FloatArray, lever_m: FloatArray, noise_m: float) -> Flo
 
 
 def _is_seen(joints: FloatArray, lever_m: FloatArray) -> BoolArray:
-    """Mask of the joints whose effect a moved sensor does not have, (k,)."""
+    """Mask of the joints whose effect a moved sensor does not have, (k,).
+
+    At least 0.001 of their motion remains (`LEAST_VISIBLE`).
+    """
     found: BoolArray = np.sum(joints**2, axis=0) > LEAST_VISIBLE**2 * lever_m**2 * (
         len(joints) / 3
     )
@@ -269,7 +281,10 @@ def evidence(x: FloatArray) -> FloatArray:
 
 
 def change(x: FloatArray) -> Change:
-    """Likeliest change of the mean of a series (T,)."""
+    """Likeliest change of the mean of a series (T,), T >= 1.
+
+    One result has no change: its value is the size. Spreads are infinite for fewer than three.
+    """
     T = len(x)
     if T < 2:
         return Change(1.0, 0, float(x[-1]), np.inf, np.inf)
@@ -285,7 +300,10 @@ def change(x: FloatArray) -> Change:
 
 
 def step(x: FloatArray, at: int) -> tuple[float, float]:
-    """Change of the mean of a series (T,) before result `at`, and its standard deviation."""
+    """Change of the mean of a series (T,) before result ``at`` (1 to T - 1), and its std.
+
+    The std is infinite for two results.
+    """
     T = len(x)
     deviations = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
     variance = float(deviations @ deviations) / (T - 2.0) if T > 2 else np.inf
@@ -294,11 +312,11 @@ def step(x: FloatArray, at: int) -> tuple[float, float]:
 
 
 def wander(x: FloatArray, at: int) -> float:
-    """Half of the 95 % interval of a change before result `at`, by the series' autocorrelation.
+    """Half of the 95 % interval of a change before result ``at``, by the series' autocorrelation.
 
     Means of consecutive results differ by more than their scatter predicts if days resemble one
-    another or there is a season: batch means, of a sixth of the series at most. 0 if there are too
-    few results.
+    another or there is a season: batch means, of a sixth of the series at most. 0 if there are
+    fewer than six batches (`BATCHES`).
     """
     T = len(x)
     deviations = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
@@ -377,12 +395,14 @@ def judge(
 ) -> CheckResult:
     """Verdict on the newest of an arm's checks.
 
+    Raises InsufficientDataError if a check has too few poses (`seen`).
+
     Parameters
     ----------
     model
         Model of the correction.
     checks
-        Checks of the same poses, oldest first; see `Measured.as_before`.
+        Checks of the same poses, oldest first, at least one; see `Measured.as_before`.
     smallest_m
         Smallest change at the tool that matters, m.
     """
@@ -519,7 +539,10 @@ def _before_and_after(T: int, at: int) -> FloatArray:
 
 
 def _scatter(values: FloatArray, days: FloatArray, at: int) -> float:
-    """Standard deviation of results (T,) or (T, n) about drifts that begin at check `at`."""
+    """Standard deviation of results (T,) or (T, n) about drifts that begin at check ``at``.
+
+    For more than one series it is the root of the sum of their variances; T > 2.
+    """
     line = np.maximum(0.0, days - days[at])
     basis = np.linalg.qr(np.stack((np.ones(len(days)), line), axis=1))[0]
     deviations = values - basis @ (basis.T @ values)
@@ -527,12 +550,12 @@ def _scatter(values: FloatArray, days: FloatArray, at: int) -> float:
 
 
 def _length(weights: FloatArray) -> float:
-    """Euclidean norm."""
+    """Euclidean norm of weights."""
     return float(np.linalg.norm(weights))
 
 
 def _projected(one: CheckResiduals, taken: FloatArray) -> CheckResiduals:
-    """Residuals of a check, projected orthogonally to the columns that are already explained."""
+    """Copy of a check's residuals and effects, projected orthogonally to columns (3 n, c)."""
     basis = np.linalg.qr(taken)[0]
 
     def projected(columns: FloatArray) -> FloatArray:
@@ -547,7 +570,7 @@ def _projected(one: CheckResiduals, taken: FloatArray) -> CheckResiduals:
 
 
 def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
-    """Change of each joint, if it alone has changed, and of each marker, m, (T, k + 3 m)."""
+    """Change at the tool of each joint alone, and of each marker, m, (T, k + 3 m)."""
     rows = [
         (
             *(_single_column_sizes(one.joints, one.residuals) * one.lever_m),
@@ -566,9 +589,10 @@ def _single_column_sizes(columns: FloatArray, residuals: FloatArray) -> FloatArr
 
 
 def _noise(residuals_of_checks: Sequence[CheckResiduals], at: int) -> float:
-    """Noise of a reading per axis, m: scatter of checks about their means before and from `at`.
+    """Noise of a reading per axis, m: scatter of checks about their means before and from ``at``.
 
-    For a single check: RMS residual, which contains the correction's own error.
+    ``at`` 0: about one mean. For a single check: RMS residual, which contains the correction's own
+    error.
     """
     rests, freedom = (
         np.array([one.residuals for one in residuals_of_checks]),
@@ -589,7 +613,12 @@ def _moved(
     residuals_of_checks: int,
     smallest_m: float,
 ) -> tuple[float, bool]:
-    """RMS displacement of the markers by the sensors' registration, m, and whether they moved."""
+    """RMS displacement of the markers by the sensors' registration, m, and whether they moved.
+
+    Moved: more than ``smallest_m`` and than noise explains at 5 standard deviations
+    (`BEYOND_STD`). ``before``: earlier registrations; ``residuals_of_checks``: number of checks
+    that give the noise.
+    """
     shift = np.zeros_like(measured.position)
     for sensor, T in last.T_R_N.items():
         selection = np.array([one == sensor for one in measured.sensor])
@@ -613,7 +642,12 @@ def _is_doubtful(
     is_seen: BoolArray,
     smallest_m: float,
 ) -> bool:
-    """Whether these checks, without an alarm, require another check."""
+    """Whether these checks, without an alarm, require another check.
+
+    Evidence above 10 (`DOUBT`) for a change that may matter, or a newest result that is outlying.
+    ``x_m``: series, (T, …); ``counts``: mask of the series that count; ``is_seen``: of joints,
+    (k,).
+    """
     found = [change(x_m[:, i]) for i in np.flatnonzero(counts)]
     best = max(found, key=lambda one: one.evidence)
     small = abs(best.size) + best.half < smallest_m
@@ -627,7 +661,10 @@ def _is_outlying(
     counts: BoolArray,
     is_seen: BoolArray,
 ) -> bool:
-    """Whether the newest result is far from those before, or the first from the correction."""
+    """Whether the newest result is far from those before, or the first from the correction.
+
+    Far: beyond 5 standard deviations (`BEYOND_STD`).
+    """
     last, T = residuals_of_checks[-1], len(residuals_of_checks)
     if T > 3:
         # Of few checks the scatter may be small by chance, but not below the noise of a reading.
@@ -667,7 +704,8 @@ def _changed_joints(
 ) -> tuple[tuple[int, ...], bool]:
     """Indices of the joints that may have changed, and whether a marker may have moved instead.
 
-    ``weights``: (T,); the change of the readings is the sum of weights times checks.
+    All explanations within odds of 20 of the best (`NAMING_ODDS`). ``weights``: (T,); the change
+    of the readings is the sum of weights times checks.
     """
     step = weights @ np.array([one.residuals for one in residuals_of_checks])
     variance = noise**2 * float(weights @ weights)

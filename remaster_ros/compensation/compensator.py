@@ -68,7 +68,10 @@ class Compensator:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """Weights of a metre and a radian in a pose error, (6,)."""
+        """Weights of a metre and a radian in a pose error, (6,): 1 / lever, then 0.05.
+
+        The lever is the largest displacement of the tip per radian of a joint, m.
+        """
         chain = self.model.chain
         frames = chain.frames(self.model.sampled_angles())
         tips = (frames[:, -1] @ chain.T_fixed[-1])[:, :3, 3]
@@ -122,7 +125,11 @@ class Compensator:
         return self._rows(lambda rows, warm: rows + self._way_back(rows, warm), q, temperature_c)
 
     def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
-        """Commands (n, k), remaining errors, and rows out of range."""
+        """Commands (n, k), remaining errors, and rows out of range, for wanted angles (n, k).
+
+        ``temperature_c``: as in `command`. Raises ValueError for another shape or numbers that are
+        not finite.
+        """
         wanted = self._checked(q).reshape(-1, self.model.joints)
         warming = self.model.warming(len(wanted), _given(temperature_c))
         command, error = np.empty_like(wanted), np.empty((len(wanted), 6))
@@ -131,13 +138,20 @@ class Compensator:
         return self.correction(command, error)
 
     def correction(self, command: FloatArray, error: FloatArray) -> Correction:
-        """Correction for commands (n, k) and the pose errors that remain, (n, 6)."""
+        """Correction for commands (n, k) and the pose errors that remain, m and rad, (n, 6).
+
+        Incomplete: over 1e-5 m or rad (`CORRECTED`) is left.
+        """
         shift, turn = (np.linalg.norm(part, axis=1) for part in np.split(error, 2, axis=1))
         incomplete = np.maximum(shift, turn) > CORRECTED
         return Correction(command, shift, turn, incomplete, self.model.outside(command))
 
     def tool(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Pose of the tool at reported joint angles, T_R_T, (..., 4, 4)."""
+        """Pose of the tool at reported joint angles (..., k), T_R_T, (..., 4, 4).
+
+        ``temperature_c``: as in `command`. Raises ValueError for another shape or numbers that are
+        not finite.
+        """
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
         found = self.model.state(rows, self._temperature(q, temperature_c)).tool
@@ -207,7 +221,10 @@ class Compensator:
         q: ArrayLike,
         temperature_c: ArrayLike | None,
     ) -> FloatArray:
-        """Apply a function of rows and warming to angles (..., k), in blocks."""
+        """Result of a function of rows (n, k) and warming (n,), for angles (..., k), in blocks.
+
+        Raises ValueError for another shape or numbers that are not finite.
+        """
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
         warming = self.model.warming(len(rows), self._temperature(q, temperature_c))
@@ -217,7 +234,10 @@ class Compensator:
         return found.reshape(q.shape)
 
     def _temperature(self, q: FloatArray, given: ArrayLike | None) -> FloatArray | None:
-        """Temperatures as (rows,); None if none are given."""
+        """Temperatures, °C, broadcast to the rows of q, (rows,); None if none are given.
+
+        Raises ValueError if they cannot be broadcast to q's shape without its last axis.
+        """
         if given is None:
             return None
         return np.broadcast_to(np.asarray(given, dtype=float), q.shape[:-1]).reshape(-1)
@@ -235,14 +255,17 @@ class Compensator:
         return q
 
     def _solved(self, wanted: FloatArray, warming: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Commands (n, k) and remaining pose errors, m and rad, (n, 6)."""
+        """Commands (n, k) and remaining pose errors, m and rad, (n, 6).
+
+        No joint is changed by more than ``most_rad``, or its own error if that is larger.
+        """
         problem = PoseProblem(self, wanted, warming)
         budget = problem.budget
         change = nearest(problem.of_rows, problem.angle_change, (-budget, budget))
         return wanted + self.model.chain.per_radian * change, problem.remaining_error(change)
 
     def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
-        """Pose errors at wanted angles (n, k) as a function of joint changes."""
+        """Problem of pose errors at wanted angles (n, k), with air at ``temperature_c``, °C."""
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
@@ -309,7 +332,7 @@ class PoseProblem:
         self.budget = np.maximum(compensator.most_rad, np.abs(self.angle_change))
 
     def of_rows(self, change: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Weighted errors (m, 6) and Jacobians (m, 6, k) at changes (m, k) of some rows."""
+        """Weighted errors (m, 6) and Jacobians (m, 6, k) of rows (m,) at changes (m, k)."""
         model, weights = self._model, self._compensator.weights
         command = self.wanted[rows] + model.chain.per_radian * change
         state = model._state(model.drivers(command, self._warming[rows]))
@@ -326,7 +349,10 @@ class PoseProblem:
 
 
 def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
-    """Poses relative to their targets in R, m and rad (rotation vector), (n, 6)."""
+    """Poses (n, 4, 4) relative to their targets, along axes of R, m and rad, (n, 6).
+
+    Shift of the origin, then rotation vector.
+    """
     turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - target[:, :3, 3]
     return np.concatenate((shift, matrix_to_rotation_vector(turn)), axis=1)

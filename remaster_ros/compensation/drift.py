@@ -41,13 +41,17 @@ class Drift:
     weights: FloatArray  # The size is the sum of weights times results, (T,)
 
     def days_left(self, smallest: float) -> float:
-        """Days until a drift of the largest likely slope reaches `smallest`; at least 0."""
+        """Days until a drift of the largest likely slope reaches ``smallest`` (m); at least 0."""
         slope = (abs(self.size) + self.half) / self.days
         return max(0.0, (smallest - abs(self.size)) / slope)
 
 
 def drift(x: FloatArray, days: FloatArray) -> Drift:
-    """Drift in a series (T,) at ascending times `days` (T,)."""
+    """Likeliest drift in a series (T,) at ascending times ``days`` (T,), and the evidence for any.
+
+    Without three results, or at a single time: evidence 1, size 0. The half interval is infinite
+    for three results.
+    """
     T = len(x)
     none = Drift(1.0, 0, 0.0, np.inf, 0.0, np.zeros(T))
     if T < 3 or days[-1] <= days[0]:
@@ -93,7 +97,7 @@ def _interval_of_batches(residuals: FloatArray, weights: FloatArray) -> float:
     """Half of the 95 % interval of a drift, from the autocorrelation of its residuals (T,).
 
     Means of consecutive residuals, of a sixth of the series at most: if days resemble one another,
-    they differ by more than their scatter predicts.
+    they differ by more than their scatter predicts. 0 for fewer than six results.
     """
     T = len(residuals)
     size = T // BATCHES

@@ -82,7 +82,7 @@ class ZeroOffsets:
 
     @property
     def left_out(self) -> dict[str, str]:
-        """Reason for each joint whose offset is not applied."""
+        """Reason for each joint whose offset is not applied, by its name."""
         unknown = np.flatnonzero(~self.identifiable).tolist()
         return {self.chain.joint_names[i]: self.why[i] for i in unknown}
 
@@ -223,7 +223,10 @@ _PAD = """\
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
-    """Table of joints whose pad has the names and angles of the URDF."""
+    """Lines of a table of joints whose pad has the names and angles of the URDF.
+
+    Turning joints in degrees first, then prismatic ones in mm.
+    """
     rows = []
     for unit in ('deg', 'mm'):
         steps_of_unit = [step for step in steps if step.unit == unit]
@@ -241,7 +244,7 @@ def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
 
 
 def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
-    """Table of joints in the pad's names and angles, coupled joints in groups."""
+    """Lines of a table of joints in the pad's names and angles, coupled joints in groups."""
     steps = [step for group in groups for step in group]
     wide = max(len('on the pad'), *(len(step.pad_name) for step in steps))
     long = max(len('in the URDF'), *(len(step.joint) for step in steps))
@@ -294,7 +297,10 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
 
 
 def layer_text(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> str:
-    """The offsets as a ROS 2 parameter file for an offset layer."""
+    """Text of a ROS 2 parameter file with the offsets for an offset layer, rad or m.
+
+    Only identifiable ones; ``remarks``: comments, a line each.
+    """
     slides = bool(offsets.chain.slides.any())
     head = (
         f'# Joint zero-offsets, rad{", m of joints that slide" if slides else ""}. '
@@ -396,13 +402,16 @@ def calibrated_urdf(
 
 
 def parsed_xml(text: str) -> ElementTree.Element:
-    """Root element of a description, with its comments."""
+    """Root element of a description, with its comments; raises ElementTree.ParseError."""
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     return ElementTree.fromstring(text, parser)
 
 
 def xml_text(before: str, root: ElementTree.Element, notes: Sequence[str]) -> str:
-    """Text of a changed description, with comments in it and the prolog of the original text."""
+    """Text of a changed description, with notes as comments in it and the prolog of the original.
+
+    ``root`` is changed: the comments become its first children.
+    """
     for text in reversed(notes):
         # Two hyphens would end the comment.
         note = ElementTree.Comment(f' {re.sub("-(?=-)", "- ", text).rstrip("-")} ')

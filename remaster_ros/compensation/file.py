@@ -175,7 +175,10 @@ class CompensationPart(Struct):
     on_tool: dict[str, Mount] | UnsetType = UNSET
 
     def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
-        """Offset or range of each joint, rad, m for prismatic ones, (k, ...)."""
+        """Offset or range of each joint, rad, m for prismatic ones, (k,) or (k, 2).
+
+        ``what``: 'offset' or 'range'.
+        """
         parts = zip(self.joints, chain.units, strict=True)
         return np.array([getattr(part, f'{what}_{unit}') for part, unit in parts])
 
@@ -305,7 +308,10 @@ def written(described: CorrectedArm, session: Session, made_by: Source, result_s
 
 
 def _triangle(root: FloatArray) -> tuple[list[int], list[list[float]]]:
-    """Columns of a root (r, p) that are not zero; rows of its triangle from the diagonal on."""
+    """Columns of a root (r, p) that are not zero (indices), and the rows of its triangle.
+
+    Each row begins at its diagonal; numbers have 10 digits.
+    """
     kept = np.flatnonzero(np.any(root != 0.0, axis=0))
     rows = np.asarray(np.linalg.qr(root[:, kept], 'r')).tolist()
     return kept.tolist(), [
@@ -314,12 +320,12 @@ def _triangle(root: FloatArray) -> tuple[list[int], list[list[float]]]:
 
 
 def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
-    """Angle at which a driver is evaluated."""
+    """Angle at which a driver is evaluated: 'with_offset' for gravity's, else 'reported'."""
     return 'with_offset' if driver.startswith('gravity') else 'reported'
 
 
 def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
-    """Key of a spline's knots, which has the unit of the angle."""
+    """Key of a spline's knots: 'knots_rad' or 'knots_m' for angles, else 'knots'."""
     return f'knots_{chain.units[joint]}' if driver == 'angle' else 'knots'
 
 
@@ -380,7 +386,7 @@ def of_text(data: bytes, path: Path) -> Compensation:
 
 
 def _refuse_huge(content: CompensationPart) -> None:
-    """Raise InputError for numbers beyond any arm's, whose products would overflow."""
+    """Raise InputError for numbers above 1e9 (`LARGEST`), whose products overflow."""
     for key, part in msgspec.to_builtins(content).items():
         # What the controller reported is shown, never computed with.
         for where, value in _numbers(part, key) if key != 'state' else ():
@@ -389,7 +395,7 @@ def _refuse_huge(content: CompensationPart) -> None:
 
 
 def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
-    """Yield all numbers of a part of the file, and their places."""
+    """Yield the dotted place and the value of all numbers of a part of the file."""
     if isinstance(value, int | float):
         yield where, value
     elif not isinstance(value, str | None):
@@ -398,7 +404,11 @@ def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
 
 
 def _model(content: CompensationPart) -> ArmModel:
-    """Model of the arm in a file. Raises InputError for contents that contradict each other."""
+    """Model of the arm in a file.
+
+    Raises InputError for contents that contradict each other, or whose correction does not
+    converge (slope of 1 or more).
+    """
     robot = content.robot
     if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
         raise _broken('robot.urdf', 'is not the text whose hash is urdf_sha256')
@@ -490,7 +500,11 @@ def _model(content: CompensationPart) -> ArmModel:
 def _root(
     model: ArmModel, part: str, names: Sequence[str], key: str, rows: Sequence[Sequence[float]]
 ) -> FloatArray:
-    """Matrix of all parameters, (r, p), from the upper triangle of some of them."""
+    """Matrix of all parameters, (r, p), from the rows of an upper triangle of the named ones.
+
+    ``part``, ``key``: for messages. Raises InputError for unknown or repeated names, or rows of
+    other lengths.
+    """
     order = {name: i for i, name in enumerate(model.parameter_names)}
     strangers = [name for name in names if name not in order]
     count = len(names)
@@ -509,7 +523,11 @@ def _root(
 def _function(
     part: TermPart, where: str, chain: SerialChain, axes: int
 ) -> tuple[Function, FloatArray]:
-    """Function and coefficients of a term; `axes` is their number for each feature."""
+    """Function and coefficients (m,) of a term of the file.
+
+    ``where``: its place, for messages; ``axes``: number of coefficients for each feature. Raises
+    InputError for contents that contradict each other.
+    """
     joint, names = -1, chain.joint_names
     if part.driver in ('angle', 'gravity_torque'):
         if part.driver_joint not in names:
@@ -549,7 +567,10 @@ def _function(
 
 
 def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
-    """Changes of the origins of all joints and of the tool."""
+    """Changes of the origins of all joints and of the tool, 0 for those that are not listed.
+
+    Raises InputError for an unknown name.
+    """
     found = Geometry.none(len(names))
     every = (*names, 'tool')
     for part in origins:
@@ -561,5 +582,5 @@ def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
 
 
 def _broken(where: str, what: str) -> InputError:
-    """InputError on a part of the file."""
+    """InputError on a part of the file: place and what is wrong, with the remedy."""
     return InputError(f'{where} {what}; write the file again with fit or discover')

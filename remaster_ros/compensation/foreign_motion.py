@@ -88,7 +88,10 @@ class SentTrajectory:
     end: tuple[FloatArray, FloatArray] | None = None
 
     def samples(self, since_s: float, until_s: float) -> FloatArray:
-        """Positions on the path between two times from its start, rad, (n, k)."""
+        """Positions on the path between two times from its start, rad, (33, k).
+
+        Evenly spaced in time; beyond the ends of the path its ends.
+        """
         waypoints = self.admitted.waypoints
         times = np.array([0.0, *(point.time_s for point in waypoints)])
         q = np.array([self.start, *(point.q for point in waypoints)])
@@ -132,7 +135,7 @@ class ArmReports:
         return taken
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether the last report is recent enough to show the arm's position."""
+        """Whether the last report came within `FRESH_S` before a wall time."""
         return wall_s - self._wall_s <= FRESH_S
 
     @property
@@ -147,7 +150,10 @@ class ArmReports:
 
     @property
     def velocity(self) -> FloatArray:
-        """Velocity, rad/s, (k,): exactly 0 if the arm stands."""
+        """Velocity by the last two reports, rad/s or m/s, (k,): exactly 0 if the arm stands.
+
+        There must be two reports (`is_known`).
+        """
         if self.stands:
             return np.zeros_like(self.q)
         (before_s, before), (stamp_s, q) = self._reports[-2], self._reports[-1]
@@ -155,7 +161,7 @@ class ArmReports:
 
     @property
     def stands(self) -> bool:
-        """Whether the arm has not moved for `following.STANDING_S`."""
+        """Whether the arm has stood for `following.STANDING_S`; False if not reported."""
         reports = self._reports
         if not reports or reports[-1][0] - reports[0][0] < STANDING_S:
             return False
@@ -282,7 +288,10 @@ def _passed(
 
 
 def _refuse_bad_numbers(wanted: Trajectory) -> None:
-    """Raise InputError for numbers that are not finite, and for times out of order or range."""
+    """Raise InputError for numbers that are not finite, or times that do not ascend from 0 on.
+
+    Also for a trajectory of over an hour (`LONGEST_S`).
+    """
     t, q, v = wanted.times_s, wanted.positions, wanted.velocities
     if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
         raise InputError('a number of it is not finite')
@@ -295,7 +304,7 @@ def _refuse_bad_numbers(wanted: Trajectory) -> None:
 def _refuse_too_fast(
     t: FloatArray, q: FloatArray, v: FloatArray | None, limits: MotionLimits
 ) -> None:
-    """Raise InputError if the planner's own speeds exceed the limits.
+    """Raise InputError if the planner's own speeds exceed the limits by over 1 %.
 
     Only ours are slowed down.
     """
@@ -317,7 +326,10 @@ def _corrected(
     temperature_c: float | None,
     believed_q: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, list[str]]:
-    """Times, positions, velocities and remarks of the trajectory to send."""
+    """Times, positions, velocities and remarks of the trajectory to send.
+
+    Arguments and errors as of `corrected_for_controller`.
+    """
     compensator, t, q, v = (
         correction.compensator, wanted.times_s, wanted.positions, wanted.velocities,
     )  # fmt: skip
@@ -360,14 +372,17 @@ def _corrected(
 
 
 def _refuse_too_large(correction: CorrectionInUse, change: FloatArray) -> None:
-    """Raise InputError if the correction changes a joint by too much."""
+    """Raise InputError if a row of the changes (n, k) is too large for a joint."""
     refused = correction.too_large(change)
     if refused:
         raise InputError(next(iter(refused.values())))
 
 
 def _notes(residual_m: FloatArray, incomplete: BoolArray, outside: BoolArray) -> list[str]:
-    """Remarks on points near a singularity or beyond a measured range."""
+    """Remarks on points near a singularity or beyond a measured range; [] without any.
+
+    ``residual_m, incomplete, outside``: as in `compensator.Correction`, (n,).
+    """
     notes = []
     if count := int(np.sum(incomplete)):
         notes.append(

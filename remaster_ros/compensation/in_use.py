@@ -112,7 +112,7 @@ class CorrectionInUse:
             )
 
     def off(self) -> CorrectionInUse:
-        """A correction of the same arm that corrects nothing."""
+        """A correction of the same arm that corrects nothing; this one is unchanged."""
         other = copy.copy(self)
         for name in ('true_arm', 'shifts', '_bends'):
             other.__dict__.pop(name, None)
@@ -180,7 +180,10 @@ class CorrectionInUse:
         return lines
 
     def too_large(self, change: FloatArray) -> dict[int, str]:
-        """Reason for each row of changes (n, k), rad, that changes a joint by too much."""
+        """Reason for each row (index) of changes (n, k), rad, that changes a joint by too much.
+
+        Too much: beyond ``most_deg``; {} if none does.
+        """
         refused = {}
         most = np.abs(change).max(axis=1, initial=0.0)
         # A change at the bound is at it to rounding.
@@ -193,17 +196,20 @@ class CorrectionInUse:
         return refused
 
     def for_waypoints(self, waypoints: FloatArray) -> tuple[FloatArray, dict[int, str]]:
-        """Commands for waypoints, rad, (n, k), and the reason for each that is refused.
+        """Commands for waypoints, rad, (n, k), and the reason for each row that is refused.
 
         The true joint angles are those of the planned way, so that the arm keeps to it. Waypoints
         need no exact tool pose, so that near a singularity no joint moves further than its own
-        error.
+        error. The command of a refused row is returned all the same.
         """
         change = self.compensator.angle_errors(waypoints)
         return waypoints + change, self.too_large(change)
 
     def commands(self, wanted: FloatArray) -> Commands:
-        """Commands for wanted configurations, rad, (n, k)."""
+        """Commands for wanted configurations, rad, (n, k); rows that are not finite are refused.
+
+        Also rows in which a joint would be changed by over ``most_deg``.
+        """
         finite = np.all(np.isfinite(wanted), axis=-1)
         done = self.compensator.correct(np.where(finite[:, None], wanted, 0.0))
         change = done.command - wanted
@@ -254,14 +260,17 @@ def _refuse_another_arm(
 
 
 def _sampled(chain: SerialChain) -> FloatArray:
-    """Random configurations within the limits, rad, (n, k)."""
+    """2,000 random configurations within the limits, rad, (2000, k), equal in each call.
+
+    Limits that are infinite count as half a turn to either side.
+    """
     lower = np.where(np.isfinite(chain.lower), chain.lower, -np.pi)
     upper = np.where(np.isfinite(chain.upper), chain.upper, np.pi)
     return np.random.default_rng(SEED).uniform(lower, upper, (SAMPLED, len(chain)))
 
 
 def _steps(frames: FloatArray) -> FloatArray:
-    """Frame of each joint in the one before, (n, k, 4, 4)."""
+    """Frame of each joint in the one before, (n, k, 4, 4), from frames in R, (n, k, 4, 4)."""
     found: FloatArray = np.concatenate(
         (frames[:, :1], inverse(frames[:, :-1]) @ frames[:, 1:]), axis=1
     )

@@ -35,7 +35,7 @@ class IsoFigures:
     repeatability_m: FloatArray
 
     def text(self) -> str:
-        """The figures, or what is missing for them, in a sentence."""
+        """AP and RP at the worst pose, mm, or what is missing for them, as a sentence."""
         if len(self.accuracy_m):
             return (
                 f'ISO 9283, {len(self.accuracy_m)} poses of {CYCLES} visits and more: accuracy '

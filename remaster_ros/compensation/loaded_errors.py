@@ -23,10 +23,10 @@ from remaster_ros.types import FloatArray, Measurements, Session
 
 
 def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> FloatArray:
-    """Errors of all rows with the model of a URDF, m, (n, 3).
+    """Errors (measured minus modelled) of all rows with the model of a URDF, m, (n, 3).
 
-    Registrations and markers are fitted to the optimization rows, except ``gross``: their
-    ``observation``.
+    Along the axes of each row's sensor. Registrations and markers are fitted to the optimization
+    rows, except ``gross``: their ``observation``; offsets are 0. Raises as `estimate`.
     """
     session = replace(session, urdf=urdf)
     m = session.measurements
@@ -37,10 +37,11 @@ def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> 
 
 
 def errors_with_correction(model: ArmModel, measurements: Measurements) -> FloatArray:
-    """Errors of all rows with the arm of a compensation.json, m, (n, 3).
+    """Errors of all rows with the arm of a compensation.json, m, (n, 3), in the sensors' frames.
 
     They contain the errors that a command leaves near singularities; nothing is fitted.
-    ``measurements`` have the model's sensors and markers by their indices.
+    ``measurements`` have the model's sensors and markers by their indices; rows without a
+    temperature have the reference's.
     """
     m = measurements
     known = np.isfinite(m.temperature_c)
@@ -59,7 +60,8 @@ def errors_with_correction(model: ArmModel, measurements: Measurements) -> Float
 def without_errors_of_measuring(fit: FitResult, parameters: slice | FloatArray) -> FloatArray:
     """Positions of all rows minus the effect of some further parameters of a fit, m, (n, 3).
 
-    ``parameters``: slice or mask of the further parameters, those of measurement errors.
+    ``parameters``: slice or mask of the further parameters, those of measurement errors. The
+    measured positions themselves if there are none.
     """
     measured = fit.session.measurements.position
     model, after = fit.predictive.model, fit.predictive.after

@@ -58,7 +58,7 @@ class MasteringStep:
         return _DIGITS[self.unit]
 
     def shown(self, value: float) -> str:
-        """An angle as the pad shows it, with its sign."""
+        """Value in the pad's unit as the pad shows it, with its sign and `digits` decimals."""
         return f'{value:+.{self.digits}f}'
 
     def in_degrees(self, value: float) -> float:
@@ -145,7 +145,10 @@ def mastering(
 
 
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
-    """True positions where joints are set, rad or m, (k,): 0, or mid-range if beyond limits."""
+    """True positions where joints are set, rad or m, (k,): 0, or mid-range if beyond limits.
+
+    Mid-range is rounded to 10 degrees or 10 mm.
+    """
     turn = np.where(chain.slides, np.inf, np.pi)
     lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
     step = np.where(chain.slides, _STEP_MM / _MM_PER_M, np.radians(_STEP_DEG))
@@ -156,7 +159,10 @@ def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
 
 
 def _coupled_groups(joints: Sequence[int], pad: PadAngles) -> list[list[int]]:
-    """Groups of coupled joints, each joint after those that are added to it."""
+    """Groups of coupled joints (indices), each joint after those that are added to it.
+
+    Sorted by the least index in each group.
+    """
     groups: list[list[int]] = []
     for i in joints:
         coupled = [g for g in groups if any(i in pad.coupled(j) or j in pad.coupled(i) for j in g)]

@@ -194,10 +194,11 @@ def arm_of_effects(
 
 
 def mounts_of(fit: FitResult, model: ArmModel) -> dict[str, Mount]:
-    """Rotation of each sensor on the tool, by its name, with the arm of a correction.
+    """Marker and rotation of each sensor on the tool, by its name, with the arm of a correction.
 
     The rotations of the fit belong to its zero-offsets. A correction leaves out those that are not
-    identifiable: with it the rotation is the mean that the fitted rows show.
+    identifiable: with it the rotation is the mean that the fitted rows show. Unset if the fit has
+    none; {} without sensors on the tool.
     """
     session, found, m = fit.session, fit.orientations, fit.measurements
     left_out = [observation for observation, _ in fit.left_out]
@@ -229,7 +230,11 @@ def _described(
     data: Residuals | None,
     widening: float,
 ) -> CorrectedArm:
-    """Arm of a fit with candidates and their parameters `theta`."""
+    """Arm of a fit with candidates and their parameters ``theta``, one after the other.
+
+    ``data``: residuals, None for no list of effects that are not corrected; ``widening``: factor
+    on standard deviations.
+    """
     chain = fit.chain
     slots: dict[Slot, int] = {}
     maps: list[tuple[Slot, slice, FloatArray]] = []
@@ -314,9 +319,9 @@ def _as_predicted(
 
 
 def _draws(fit: FitResult) -> tuple[FloatArray, FloatArray]:
-    """Draws of offsets, registrations and markers, (draws, p), and the mean offsets.
+    """Draws of offsets, registrations and markers, (draws, p), and the mean offsets, (k,).
 
-    Registrations are steps from their mean, in R.
+    Registrations are steps (shift and rotation vector) from their mean, in R.
     """
     model, z = fit.predictive.model, fit.predictive.draws.copy()
     # Offsets that the gauge fixes are exactly zero.
@@ -341,7 +346,10 @@ def _model(
     temperatures: tuple[float, float],
     widening: float,
 ) -> ArmModel:
-    """Model with coefficients in their slots."""
+    """Model with coefficients in their slots, offsets 0 and no covariance.
+
+    ``temperatures``: reference and mean, °C.
+    """
     joints = len(chain)
     found = fit.predictive.model
     x = found.natural(fit.predictive.after)
@@ -379,7 +387,7 @@ def _model(
 def _in_order(
     model: ArmModel, slots: Mapping[Slot, int], spread: Mapping[Slot, FloatArray], count: int
 ) -> FloatArray:
-    """Draws of the further parameters in the order of the model, (count, p)."""
+    """Draws of the further parameters in the model's order, (count, p), 0 in unused ones."""
     joints = model.joints
     parts = [spread[slot] for slot in slots if slot.kind == 'joint']
     parts += [spread[slot] for slot in slots if slot.kind == 'base']
@@ -392,7 +400,10 @@ def _in_order(
 
 
 def _temperatures(measurements: Measurements) -> tuple[float, float]:
-    """First known temperature, as in `Context.warming`, and mean temperature, °C."""
+    """First known temperature, as in `Context.warming`, and mean of the fitted rows, °C.
+
+    NaN without any.
+    """
     known = np.isfinite(measurements.temperature_c)
     if not known.any():
         return np.nan, np.nan
@@ -425,7 +436,10 @@ def slots_of(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, F
 
 
 def _of_links(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a candidate of a link."""
+    """Yield slots and matrices of a candidate of a link; nothing if it has no place in the model.
+
+    A soft bearing across the axis, or shifts, turns and lengths that grow with the temperature.
+    """
     zeros = np.zeros((3, candidate.size))
     if candidate.driver == 'gravity_moment' and candidate.size == 1:
         yield Slot('lateral', candidate.joints[0] - 1), np.ones((1, 1))
@@ -444,7 +458,7 @@ def _of_links(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, 
 
 
 def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a candidate of the base."""
+    """Yield slots and matrices of a base candidate; none if it has no place here."""
     if candidate.driver == 'gravity_moment' and candidate.form == 'linear':
         axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
         if candidate.variant in axes:
@@ -461,7 +475,10 @@ def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
 
 
 def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, FloatArray]]:
-    """Yield functions and matrices of a candidate; ``joint`` is for a driver that names none."""
+    """Yield functions and matrices of a candidate; nothing for an unknown driver or form.
+
+    ``joint``: index from 0, for a driver that names none.
+    """
     if candidate.happened:
         # The arm is as it was after what happened.
         if candidate.form == 'step':
@@ -490,7 +507,7 @@ def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, Flo
 
 
 def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
-    """A curve as splines, and the matrix from its free heights to all coefficients."""
+    """Function of a curve as splines, and the matrix from its free heights to all coefficients."""
     heights = curve.heights
     if curve.closed:
         # The last splines are the first ones of the next turn.
@@ -512,7 +529,10 @@ _NOT_TOLD = (
 def _not_corrected(
     candidates: Sequence[tuple[Candidate, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
-    """Yield the effects that are not corrected, one for the candidates of the same joints."""
+    """Yield the effects that are not corrected, one for the candidates of the same joints.
+
+    Effects that round to 0.000 mm RMS are left out. ``candidates``: with their slices of theta.
+    """
     by_effect: dict[tuple[str, tuple[int, ...], str], FloatArray] = {}
     remedies = {}
     for candidate, where in candidates:

@@ -92,7 +92,10 @@ class MotorNumber:
 
 
 def motor_text(offsets: ZeroOffsets, motors: Mapping[str, MotorNumber]) -> str:
-    """Text with the motor numbers to store, for joints that are not coupled to others."""
+    """Text with the motor numbers to store: new = old + direction × counts per degree × offset.
+
+    ``motors``: by joint. Joints that slide, are coupled or not determined have the reason instead.
+    """
     pad = PadAngles.of(offsets.controller, offsets.chain.joint_names)
     shown = np.degrees(pad.offsets_on_pad(offsets.applied))
     lines = [

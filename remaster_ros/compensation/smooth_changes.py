@@ -82,7 +82,7 @@ class SmoothChanges:
     pull: FloatArray
 
     def at(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Changes and speeds at times, (m, k) each."""
+        """Changes, rad, and speeds, rad/s, at times (m,), each (m, k), by the cubics."""
         cubic = scipy.interpolate.CubicHermiteSpline(self.times_s, self.change, self.speed)
         return np.asarray(cubic(times)), np.asarray(cubic(times, 1))
 
@@ -161,7 +161,11 @@ def smooth_changes(
 
 
 def accelerations(rows: FloatArray, state: FloatArray) -> FloatArray:
-    """Accelerations of cubics at both ends of each interval, (n - 1, 2, k)."""
+    """Accelerations of cubics at both ends of each interval, (n - 1, 2, k).
+
+    ``rows``: from (value, speed) before and after each interval, (n - 1, 2, 4); ``state``: values
+    and speeds, (n, 2, k).
+    """
     both = np.concatenate((state[:-1], state[1:]), axis=1)
     return np.asarray(np.einsum('nej,njk->nek', rows, both))
 
@@ -195,7 +199,11 @@ def _step(
     pull: FloatArray,
     fixed: BoolArray,
 ) -> FloatArray:
-    """Gauss–Newton step of changes and speeds, (n, 2, k)."""
+    """Gauss–Newton step of changes and speeds, (n, 2, k); 0 where ``fixed``.
+
+    ``error, jacobian``: weighted, (n, 6) and (n, 6, k); ``rows``: as of `accelerations`; ``h``:
+    intervals, s; ``share``: of each time in the integral, s; ``weight, pull``: ρ and κ.
+    """
     n, _, k = state.shape
     turned = jacobian.swapaxes(1, 2)
     change = state[:, 0]

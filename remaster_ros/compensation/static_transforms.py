@@ -54,7 +54,7 @@ class StaticTransform:
 
     @property
     def words(self) -> str:
-        """Frames and standard deviations, as text."""
+        """Frames and standard deviations, mm and degrees, as text."""
         mm = ' '.join(f'{1e3 * value:.3f}' for value in self.std_m)
         degrees = ' '.join(f'{value:.4f}' for value in np.degrees(self.std_rad))
         return f'{self.parent} -> {self.child}: std x y z {mm} mm, about x y z {degrees} deg'
@@ -135,12 +135,12 @@ def static_transforms(
 
 
 def _std(root: FloatArray) -> tuple[float, ...]:
-    """Standard deviations of parameters with covariance U' U; U is (r, p)."""
+    """Standard deviations (p,) of parameters with covariance U' U; U is (r, p)."""
     return tuple(np.linalg.norm(root, axis=0).tolist())
 
 
 def transform_files(transforms: list[StaticTransform]) -> dict[str, str]:
-    """Launch file and tf2_msgs/TFMessage of static transforms, name -> text."""
+    """Launch file and tf2_msgs/TFMessage (YAML) of static transforms, name -> text."""
     nodes = [
         f'  <node pkg="tf2_ros" exec="static_transform_publisher" '
         f'name={quoteattr(_node_name(one.child))}\n        args={quoteattr(one.arguments)}/>'
@@ -168,5 +168,5 @@ def transform_files(transforms: list[StaticTransform]) -> dict[str, str]:
 
 
 def _node_name(frame: str) -> str:
-    """Name of the node that publishes a frame."""
+    """Node name of a frame: characters other than letters and digits become '_'."""
     return 'static_transform_of_' + re.sub(r'[^A-Za-z0-9_]', '_', frame)

@@ -155,7 +155,10 @@ def corrected_trajectory(
 def largest_speeds(
     times_s: FloatArray, positions: FloatArray, velocities: FloatArray | None
 ) -> FloatArray:
-    """Largest speed of each joint on the path that a controller draws, rad/s, (k,)."""
+    """Largest speed of each joint on the path that a controller draws, rad/s or m/s, (k,).
+
+    Cubics with velocities, lines if they are None; at least two points at ascending times.
+    """
     return DrawnPath(times_s, positions, velocities).largest()[0]
 
 
@@ -167,7 +170,7 @@ class DrawnPath:
         self._cubic = None if v is None else scipy.interpolate.CubicHermiteSpline(t, q, v)
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Positions at times, (n, k)."""
+        """Positions at times (n,), (n, k); beyond the ends lines hold the end, cubics go on."""
         if self._cubic is not None:
             return np.asarray(self._cubic(times))
         return np.stack([np.interp(times, self.t, q) for q in self.q.T], axis=1)
@@ -191,7 +194,7 @@ class DrawnPath:
         return np.stack((start, (2.0 * first + 4.0 * last - 6.0 * slope) / h), axis=1)
 
     def largest(self) -> tuple[FloatArray, FloatArray]:
-        """Largest speed and acceleration of each joint, (k,) each."""
+        """Largest speed and acceleration of each joint, (k,) each; NaN accelerations for lines."""
         h = np.diff(self.t)[:, None]
         if self.v is None:
             slope = np.diff(self.q, axis=0) / h
@@ -214,7 +217,11 @@ def _checked(
     positions: ArrayLike,
     velocities: ArrayLike | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-    """Times, positions and velocities as arrays. Raises InputError if they are not usable."""
+    """Times, positions and velocities as arrays.
+
+    Raises InputError for other shapes, numbers that are not finite, or fewer than two points at
+    ascending times.
+    """
     t, q = np.asarray(times_s, dtype=float), np.asarray(positions, dtype=float)
     v = None if velocities is None else np.asarray(velocities, dtype=float)
     shape = (len(t) if t.ndim == 1 else 0, compensator.model.joints)
@@ -232,7 +239,10 @@ def _checked(
 
 
 def _sampling_times(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
-    """Times dense enough that the correction has no unseen wave between them."""
+    """Times dense enough that the correction has no unseen wave between them, with those wanted.
+
+    Steps of 0.5 rad, or an eighth of the shortest wave; not below 1 ms.
+    """
     orders = [term.function.order for term in compensator.model.joint_terms]
     step = min(LONGEST_STEP_RAD, 2.0 * np.pi / (POINTS_OF_WAVE * max([1, *orders])))
     h = np.diff(wanted.t)
@@ -295,7 +305,9 @@ def _corrected(
 ) -> tuple[DrawnPath, Correction, SmoothChanges]:
     """Corrected path through points at given times, the correction of the points.
 
-    Last result: its changes.
+    Last result: its changes at the knots. ``knots``: indices of the times at which changes are
+    sought; ``limits``: largest speeds and accelerations, (k,) each; ``before``: changes for fewer
+    times.
     """
     q = wanted.at(times)
     v = None if wanted.v is None else wanted.speed(times)
@@ -395,5 +407,5 @@ def corrected_points(
 
 
 def _added(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Relative increase of values, 0 if there was none before."""
+    """Relative increase of values (k,), 0 if there was none before."""
     return np.divide(after, before, out=np.ones_like(after), where=before > 0.0) - 1.0

@@ -110,7 +110,8 @@ def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
     Raises
     ------
     InsufficientDataError
-        Too few rows with the correction on to fit base and marker again.
+        Too few rows with the correction on to fit base and marker again and have over 3 numbers
+        left.
     """
     on = _ProjectedRows(compensator, visits, np.flatnonzero(visits.on))
     off_rows = np.flatnonzero(~visits.on)
@@ -178,7 +179,7 @@ class _ProjectedRows:
         self._complement = left[:, self.base_columns :]
 
     def seen(self, q: FloatArray) -> FloatArray:
-        """Positions of the markers at commanded angles, in R, (n, 3)."""
+        """Positions of the markers at commanded angles (n, k), in R, m, (n, 3), by the model."""
         return apply(self.compensator.tool(q), self.places)
 
     def projected(self, columns: FloatArray) -> FloatArray:
@@ -190,14 +191,17 @@ class _ProjectedRows:
         return found
 
     def moves(self, q: FloatArray) -> FloatArray:
-        """Displacements by a share of 1 of each joint's correction, (3 n, k)."""
+        """Displacements by a share of 1 of each joint's correction, m, (3 n, k).
+
+        ``q``: angles at which they are linear, (n, k).
+        """
         change = self.command - self.wanted
         return (self._derivative(q)[:, :, : self.model.joints] * change[:, None, :]).reshape(
             3 * len(q), -1
         )
 
     def unsure(self, q: FloatArray) -> FloatArray:
-        """Displacements by one standard deviation of each uncertain parameter, (3 n, r)."""
+        """Displacements by one standard deviation of each uncertain parameter, m, (3 n, r)."""
         spread = self.model.widening * (self._derivative(q) @ self.model.root.T)
         return spread.reshape(3 * len(q), -1)
 
@@ -211,13 +215,13 @@ class _ProjectedRows:
         return found
 
     def error(self) -> Mean:
-        """Mean error from the wanted positions, base and marker fitted again."""
+        """Mean error from the wanted positions, base and marker fitted again, mm."""
         errors = self._complement @ self.projected(self.measured - self.nominal.ravel())
         return _mean(np.linalg.norm(errors.reshape(-1, 3), axis=1))
 
 
 def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, FloatArray]:
-    """Angles that reach the joints for wanted ones in each state, rad, (n, k)."""
+    """Angles that reach the joints for wanted ones (n, k) in each state, rad or m, (n, k)."""
     once = compensator.command(wanted)
     return {
         'in_use': once,
@@ -228,7 +232,7 @@ def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, Floa
 
 
 def _mean(errors: FloatArray) -> Mean:
-    """Mean of errors, m, and its 95 % interval."""
+    """Mean of errors (n,), m, and its 95 % interval, mm; infinite at the top for one error."""
     mean = float(errors.mean())
     half = 1.96 * float(errors.std(ddof=1)) / np.sqrt(len(errors)) if len(errors) > 1 else np.inf
     return Mean(1e3 * mean, (1e3 * max(0.0, mean - half), 1e3 * (mean + half)))
@@ -254,13 +258,16 @@ def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
 
 
 def _integrated(values: FloatArray) -> float:
-    """Logarithm of the mean of likelihoods over the noise, from their logarithms."""
+    """Logarithm of the mean likelihood over the noise `SIGMAS`, from those at each."""
     top = values.max()
     return float(top + np.log(np.mean(np.exp(values - top))))
 
 
 def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
-    """Estimate of the whole, of each joint, and displacements of the alternatives not excluded."""
+    """Estimate of the whole, of each joint, and displacements of the alternatives not excluded.
+
+    An alternative (another state, or a joint in one) is excluded by odds of 1000 (`ODDS`).
+    """
     states, other = {}, {}
     for state, q in side.commands.items():
         residual = side.projected(side.measured - side.at[state])
@@ -317,7 +324,10 @@ def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
 
 
 def _decided(states: Mapping[Verdict, float], other: float) -> Verdict:
-    """State with the best log evidence, if its odds suffice; else 'unclear' or 'other'."""
+    """State with the best log evidence, if its odds are 1000 (`ODDS`); else 'unclear' or 'other'.
+
+    ``states``: log evidence of each; ``other``: that of a share of its own for each joint.
+    """
     first, second = sorted(states, key=lambda state: states[state], reverse=True)[:2]
     if other - states[first] > np.log(ODDS):
         return 'other'
@@ -329,7 +339,10 @@ def _decided(states: Mapping[Verdict, float], other: float) -> Verdict:
 def _shares(
     side: _ProjectedRows, start: Verdict, sigma: float, whole: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Shares and their standard deviations: of the whole correction, or of each joint."""
+    """Shares and their standard deviations: of the whole correction, (1,), or of each joint, (k,).
+
+    ``start``: state to begin from; ``sigma``: noise, m.
+    """
     begin = STATES[start]
     change = side.command - side.wanted
     k = change.shape[1]
@@ -353,7 +366,10 @@ def _shares(
 
 
 def _state_of_share(share: float, std: float) -> Verdict:
-    """State of a share, if its odds against the others suffice; else 'unclear' or 'other'."""
+    """State of a share, if its odds against the others are 1000; else 'unclear' or 'other'.
+
+    'unclear' also for a std of 1 or more, 'other' beyond 3.3 stds of the nearest state.
+    """
     squared_distance = {state: ((share - value) / std) ** 2 for state, value in STATES.items()}
     first, second = sorted(squared_distance, key=lambda state: squared_distance[state])[:2]
     if std >= 0.5 * SHARE_STD or 0.5 * (
@@ -364,7 +380,11 @@ def _state_of_share(share: float, std: float) -> Verdict:
 
 
 def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, float | None]:
-    """Share that is switched, and the noise of a row, mm; None for too few pairs."""
+    """Share that is switched, with its state, and the noise of a row, mm.
+
+    From pairs of rows, on and off, of the same configuration, sensor and marker; both None for
+    fewer than two pairs.
+    """
     pairs = []
     for row in np.flatnonzero(visits.on):
         same = [
