@@ -146,8 +146,9 @@ def moving_before(model: UrdfModel, base_link: str) -> list[str]:
 def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[str]:
     """Return the names of the prismatic joints that likely belong to the arm.
 
-    ``names``: if it has joints of the robot, the prismatic ones among them are returned.
-    ``carrying``: whether a joint that carries an arm of five revolute joints counts.
+    ``names``: if it has joints of the robot, the prismatic ones among them are returned. Else
+    mimic joints, jaws, and joints behind `_HAND_BEHIND` revolute ones that carry none are left
+    out. ``carrying``: whether a joint that carries an arm of that many revolute joints counts.
     """
     joints = model.parent_joint.values()
     named = [joint for joint in joints if joint.kind != 'fixed' and joint.name in names]
@@ -221,7 +222,7 @@ def _arm(
 
 
 def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
-    """Return the next moving joints behind a link."""
+    """Return the next moving joints behind a link, behind fixed ones too; [] at a leaf."""
     joints = []
     for joint in model.child_joints[link]:
         joints += [joint] if joint.kind != 'fixed' else _moved_from(model, joint.child)
@@ -229,7 +230,10 @@ def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
 
 
 def _is_jaw(joint: UrdfJoint) -> bool:
-    """Return whether a joint moves a part of a gripper, by its name."""
+    """Whether a joint moves a part of a gripper, by its name or its child's (`_JAWS`, ``grip``).
+
+    A name with ``grip`` and a word for turning the whole gripper (`_WHOLE`) is none.
+    """
     name = joint.name.lower()
     if any(word in part for word in _JAWS for part in (name, joint.child.lower())):
         return True

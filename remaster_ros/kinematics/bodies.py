@@ -59,7 +59,10 @@ class Shape:
 
     @cached_property
     def capsule(self) -> tuple[FloatArray, FloatArray, float]:
-        """Ends (m, (3,) each) and radius (m) of a small capsule around the shape."""
+        """Ends (m, (3,) each) and radius (m) of a small capsule around the shape.
+
+        Of a box or hull that of least volume along six axes; the ends of a sphere are one point.
+        """
         if self.kind in ('sphere', 'capsule', 'cylinder'):
             return self.points[0], self.points[-1], self.ball + self.disc
         best = (np.zeros(3), np.zeros(3), np.inf, np.inf)
@@ -92,7 +95,10 @@ class Shape:
 
 
 def box(size_m: ArrayLike) -> Shape:
-    """Return a box with these edge lengths along x, y, z, m, (3,)."""
+    """Return a box with these edge lengths along x, y, z, m, (3,), centred at the origin.
+
+    Raises InputError, as the other shapes do, if a size is not positive and finite.
+    """
     size = _positive('box', size_m, 3)
     return Shape('box', _CUBE * size / 2)
 
@@ -110,7 +116,10 @@ def sphere(radius_m: float) -> Shape:
 
 
 def capsule(start: ArrayLike, end: ArrayLike, radius_m: float) -> Shape:
-    """Return a capsule: all points within a radius of the segment from start to end, m, (3,)."""
+    """Return a capsule: all points within a radius of the segment from start to end, m, (3,).
+
+    Raises InputError if the radius is not positive and finite; start and end may be equal.
+    """
     (radius,) = _positive('capsule', (radius_m,), 1)
     return Shape('capsule', np.array([start, end], dtype=float), ball=radius)
 
@@ -169,13 +178,19 @@ class Body:
 def obstacle(
     name: str, center_m: ArrayLike, size_m: ArrayLike, rotation: ArrayLike | None = None
 ) -> Body:
-    """Return a box that stands in the base frame; `rotation` is (3, 3), None for no rotation."""
+    """Return a box that stands in the base frame; `rotation` is (3, 3), None for no rotation.
+
+    ``center_m, size_m``: m, (3,). Raises InputError as `box`.
+    """
     turn = np.eye(3) if rotation is None else np.asarray(rotation, dtype=float)
     return Body(name, 0, box(size_m), transform(turn, np.asarray(center_m, float)), 'obstacle')
 
 
 def triangles(points: FloatArray) -> IntArray:
-    """Return the outward triangles of the convex hull of points (n, 3), as indices (m, 3)."""
+    """Return the outward triangles of the convex hull of points (n, 3), as indices (m, 3).
+
+    Counterclockwise seen from outside. Raises scipy's QhullError if the points lie in one plane.
+    """
     convex = ConvexHull(points)
     faces = convex.simplices.astype(np.int64)
     a, b, c = (points[faces[:, i]] for i in range(3))
@@ -185,7 +200,11 @@ def triangles(points: FloatArray) -> IntArray:
 
 
 def enclosing_points(points: FloatArray) -> FloatArray:
-    """Return at most 60 points whose hull contains the points (n, 3): hull corners, or a box."""
+    """Return at most `_MOST_POINTS` points whose hull contains the points (n, 3).
+
+    The corners of their hull, or of their bounding box if these are more; up to 8 points, or
+    points in one plane, as they are.
+    """
     if len(points) > 8:
         with suppress(QhullError):  # all in one plane: kept as they are
             points = points[np.sort(ConvexHull(points).vertices)]

@@ -103,7 +103,10 @@ class BodyPairs:
         return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
 
     def _on_one_line(self, joints: Sequence[int]) -> bool:
-        """Return whether the joints between two links all move along and about one line."""
+        """Whether the joints between two links all move along and about one line.
+
+        True of a single joint; False of several without a slide. ``joints``: indices from 0.
+        """
         if len(joints) < 2:
             return True
         if not any(self.chain.slides[joint] for joint in joints):
@@ -169,7 +172,10 @@ class BodyPairs:
         self._set_pairs(self.inner[~out], self.outer[~out], contact_only[~out])
 
     def category(self, pair: int) -> str:
-        """Return the category of a collision of a pair: with itself, the floor or an obstacle."""
+        """Return the category of a collision of a pair: with itself, the floor or an obstacle.
+
+        One of `SELF_COLLISION`, `FLOOR`, `OBSTACLE`; ``pair``: index, as everywhere here.
+        """
         if self.is_floor[pair]:
             return FLOOR
         inner = self.bodies[self.inner[pair]]
@@ -201,7 +207,7 @@ class BodyPairs:
         return reach
 
     def place(self, q: FloatArray) -> Placed:
-        """Return the bodies at configurations (n, k)."""
+        """Return the bodies at configurations (n, k), rad or m; limits are not checked."""
         frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
         frames[:, 0] = np.eye(4)
         frames[:, 1:] = self.chain.frames(q)
@@ -209,7 +215,10 @@ class BodyPairs:
         return Placed(frames, apply(links, self._a), apply(links, self._b))
 
     def lower_bounds(self, placed: Placed) -> FloatArray:
-        """Return lower bounds on the distance of each pair, m, (n, P)."""
+        """Return lower bounds on the distance of each pair, m, (n, P), by capsules around bodies.
+
+        Negative if the capsules overlap; exact for spheres and capsules.
+        """
         a, b, radius = placed.a, placed.b, self._radius
         bounds = np.empty((len(a), len(self.inner)))
         floor, boxes, capsules = self._kinds
@@ -232,9 +241,9 @@ class BodyPairs:
         return bounds
 
     def kept(self, placed: Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
-        """Return the clearances of pairs, m, (c,).
+        """Return the clearances of pairs, m, (c,): margin + unknown_offset · √(Σ lever²).
 
-        ``rows``, ``pairs``: indices of configuration and pair of each, (c,).
+        At most `most_kept`. ``rows``, ``pairs``: indices of configuration and pair of each, (c,).
         """
         frames = placed.frames[rows, 1:]
         axes = self.chain.axes_in_base(frames)
@@ -291,8 +300,9 @@ class BodyPairs:
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
         """Return possible violations: rows, pairs, their clearances, and whether each is certain.
 
-        Distances that need no coal are computed at once, and only violations of these are
-        returned, as certain. ``is_open``: pairs to consider, (n, P), None for all.
+        Distances that need no coal are computed at once and written into `bounds`, and only
+        violations of these are returned, as certain. ``bounds``: of `lower_bounds`, (n, P);
+        ``is_open``: pairs to consider, (n, P), None for all; ``extra``: added to the clearance, m.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top
@@ -311,7 +321,8 @@ class BodyPairs:
     ) -> tuple[list[Shortfall], FloatArray]:
         """Return the violations, and the distances or lower bounds of all pairs, m, (n, P).
 
-        With `first`, one violation of each configuration at most; with `one`, one in all.
+        ``extra``: added to the clearance, m. With `first`, one violation of each configuration at
+        most, not always the worst; with `one`, one in all.
         """
         bounds = self.lower_bounds(placed)
         rows, pairs, kept, decided = self.candidates(placed, bounds, None, extra)

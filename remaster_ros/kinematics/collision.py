@@ -148,7 +148,7 @@ class CollisionModel:
     def trouble(self, q: ArrayLike, extra: float = 0.0) -> str:
         """Return the worst violation of the clearance at q (k,) as text; '' if it is free.
 
-        ``extra``: added to the clearance, m.
+        q: rad or m; joint limits are not checked. ``extra``: added to the clearance, m.
         """
         found = self.shortfalls(np.asarray(q, dtype=float)[None], extra)
         if not found:
@@ -217,7 +217,10 @@ class CollisionModel:
         return float((self._pairs.levers @ np.abs(end - start)).max(initial=0.0))
 
     def pair_distances(self, q: FloatArray, pairs: IntArray) -> FloatArray:
-        """Return the distances of pairs (p,) at configurations (n, k), m, (n, p)."""
+        """Return the distances of pairs (p,), by index, at configurations (n, k), m, (n, p).
+
+        Negative if the bodies overlap.
+        """
         placed = self._pairs.place(q)
         bounds = self._pairs.lower_bounds(placed)
         for column in pairs:
@@ -232,7 +235,8 @@ class CollisionModel:
     ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
         """Return a category of collision for each configuration (m, k), '' if it is free, (m,).
 
-        The categories are those of `body_pairs`; ``extra``: added to the clearance, m.
+        The categories are those of `body_pairs`, of any violated pair; joint limits are not
+        checked. ``extra``: added to the clearance, m.
         """
         q = np.asarray(q, dtype=float).reshape(-1, len(self.chain))
         reasons = np.full(len(q), '', dtype=f'U{len(OBSTACLE)}')
@@ -241,7 +245,7 @@ class CollisionModel:
         return reasons
 
     def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
-        """Return whether each configuration (m, k) is free, (m,); ``extra``: as above."""
+        """Whether each configuration (m, k), rad or m, is free, (m,); see `reasons`."""
         return self.reasons(q, extra) == ''
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
@@ -271,7 +275,7 @@ class CollisionModel:
         return self._pairs.examine(self._pairs.place(q), extra, first=first)[0]
 
     def describe(self, short: Shortfall) -> str:
-        """Return a shortfall as text."""
+        """Return a shortfall as text: bodies, distance or depth, and clearance, in mm."""
         inner, outer = self._pairs.names(short.pair)
         kept = f'{1e3 * short.kept:.0f} mm is kept'
         if short.distance < 0.0:
@@ -279,7 +283,10 @@ class CollisionModel:
         return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
 
     def _limit_trouble(self, q: FloatArray) -> str:
-        """Return in words the joint furthest outside its limits, over waypoints (n, k); or ''."""
+        """Return in words the joint furthest outside its limits, over waypoints (n, k); or ''.
+
+        A tolerance of `_LIMIT_TOLERANCE` is accepted.
+        """
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
         if np.max(over) <= _LIMIT_TOLERANCE:
@@ -293,7 +300,10 @@ class CollisionModel:
         return f'{chain.joint_names[joint]} at {at}, its limits are {low.split()[0]} to {high}'
 
     def _sweep(self, start: FloatArray, end: FloatArray, extra: float) -> Shortfall | None:
-        """Return a violation of the clearance on a straight path; None if it is free."""
+        """Return a violation of the clearance on a straight path; None if it is free.
+
+        Checked in steps in which no body moves by more than `STEP_M` relative to another.
+        """
         travel = self._pairs.levers @ np.abs(end - start)
         steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
         grid = np.unique(np.append(np.arange(0, steps, _STRIDE), steps))

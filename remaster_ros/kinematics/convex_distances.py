@@ -25,7 +25,7 @@ class ConvexDistances:
 
     @cached_property
     def _coal(self) -> Any:
-        """The module coal, or hppfcl, its name before version 3."""
+        """The module coal, or hppfcl, its name before version 3, with coal's names."""
         # Imported here: commands that move nothing need not load it.
         try:
             import coal

@@ -73,7 +73,10 @@ def free_path(
 
 
 def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) -> bool:
-    """Whether the straight path is free; with the planner's reserve if the start has it too."""
+    """Whether the straight path is free; with the planner's reserve if the start has it too.
+
+    Joint limits count. ``start, end``: rad or m, (k,).
+    """
     extra = RESERVE_M if model.free_mask(start[None], RESERVE_M)[0] else 0.0
     return not model.path_trouble(np.array([start, end]), extra)
 
@@ -81,7 +84,11 @@ def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) 
 def _intermediates(
     model: CollisionModel, start: FloatArray, end: FloatArray, hints: Sequence[FloatArray]
 ) -> Iterator[list[FloatArray]]:
-    """Yield likely intermediate waypoints, the likeliest first."""
+    """Yield likely intermediate waypoints, the likeliest first.
+
+    Each hint alone; start and end moved towards the middle by 0.35, 0.7 and 1; then the corners at
+    which the first joint moves before or after the others.
+    """
     for hint in hints:
         yield [np.asarray(hint, dtype=float)]
     chain = model.chain
@@ -132,14 +139,19 @@ class _Search:
 
     @property
     def is_out_of_effort(self) -> bool:
+        """Whether the number of checked segments is used up."""
         return self._effort <= 0
 
     def is_free(self, a: FloatArray, b: FloatArray) -> bool:
+        """Whether a straight path is free and within the limits; counts as one segment."""
         self._effort -= 1
         return not self._model.path_trouble(np.array([a, b]), self._extra)
 
     def connect(self, rng: np.random.Generator) -> list[FloatArray] | None:
-        """Return a path found by growing trees from both ends; None if the effort is used up."""
+        """Return a path found by growing trees from both ends; None if the effort is used up.
+
+        From start to end, both included; not shortened.
+        """
         chain = self._model.chain
         low = np.maximum(chain.lower, np.minimum(self._start, self._end) - np.pi)
         high = np.minimum(chain.upper, np.maximum(self._start, self._end) + np.pi)
@@ -164,7 +176,10 @@ class _Search:
         return None
 
     def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
-        """Grow a tree one step towards a configuration; return the new node, None if blocked."""
+        """Grow a tree one step towards a configuration; return the new node, None if blocked.
+
+        From its nearest node, by `REACH_RAD` at most, or to the configuration itself.
+        """
         ways = np.abs(np.array([node.q for node in tree]) - goal)
         distances = np.max(ways / self._model.chain.per_radian, axis=1)
         nearest = tree[int(np.argmin(distances))]
@@ -176,7 +191,10 @@ class _Search:
         return new
 
     def _reach(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
-        """Grow a tree until it reaches a configuration; None if an obstacle blocks it."""
+        """Grow a tree until it reaches a configuration; return the node there.
+
+        None if an obstacle blocks it, or the effort is used up.
+        """
         while not self.is_out_of_effort:
             new = self._extend(tree, goal)
             if new is None or np.max(np.abs(new.q - goal)) < 1e-12:
@@ -184,7 +202,7 @@ class _Search:
         return None
 
     def shortened(self, way: list[FloatArray], rng: np.random.Generator) -> FloatArray:
-        """Return a free path with corners cut if the shorter path is free."""
+        """Return a free path with corners cut where that is free, (n, k), with the same ends."""
         path = [np.asarray(q) for q in way]
         self._effort = max(self._effort, 2 * _SHORTCUTS)
         for _ in range(_SHORTCUTS):
@@ -263,7 +281,10 @@ def way_out(
 
 
 def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
-    """Return an escape path (n, k) with fewer waypoints: the arm comes to rest at each of them."""
+    """Return an escape path (n, k) with fewer waypoints: the arm comes to rest at each of them.
+
+    A subset of its waypoints, ends included; each line is an escape again.
+    """
     kept, corner, last = [way[0]], 0, len(way) - 1
     while corner < last:
         next_corner = last

@@ -268,7 +268,11 @@ class InverseKinematics:
         )
 
     def missed_solutions(self) -> MissedSolutions:
-        """Counts of solutions that many starts found at evenly spread poses, and how often."""
+        """Counts of solutions that many starts found at evenly spread poses, and how often.
+
+        `TRIAL_POSES` poses, `STARTS` starts each, with the first of the held values. Takes
+        seconds.
+        """
         seeds = spread(self.chain, range(len(self.chain)), TRIAL_POSES)
         counts = []
         for q in seeds:
@@ -307,9 +311,10 @@ class InverseKinematics:
         return [distinct(self.chain, of_pose)[0] for of_pose in np.split(q[reached], ends)]
 
     def usable(self, q: FloatArray) -> FloatArray:
-        """Return the solutions of q (m, k) that lie within the joint limits, (n, k).
+        """Return the solutions of q (m, k) that lie within the joint limits, (n, k), in order.
 
-        Each joint is first moved by whole turns as near as possible to the middle of its range.
+        Each joint is first moved by whole turns as near as possible to the middle of its range;
+        the limits have a tolerance of 1e-9.
         """
         q = self._towards_middle(q)
         return q[self.chain.within_limits(q, tolerance=1e-9)]
@@ -355,7 +360,11 @@ class InverseKinematics:
         )
 
     def _nearest_exact(self, values: tuple[float, ...]) -> _ExactArm | None:
-        """Return the nearest arm with a closed form; None if there is none within tolerance."""
+        """Return the nearest arm with a closed form; None if there is none within tolerance.
+
+        ``values``: of the held joints, in order. None also with fewer than six free joints, or a
+        slide. The tolerance of axes is `NEAR_RAD` and `NEAR_M`.
+        """
         chain, free = self.chain, self._free
         if len(free) < FREE_JOINTS or chain.slides[free].any():
             return None
@@ -396,7 +405,10 @@ class InverseKinematics:
         )
 
     def _towards_middle(self, q: FloatArray) -> FloatArray:
-        """Return q (m, k) with whole turns taken off towards the middle of the ranges."""
+        """Return q (m, k) with whole turns taken off towards the middle of the ranges.
+
+        Towards 0 for a joint without limits; a prismatic joint is unchanged.
+        """
         bounded = np.isfinite(self.chain.lower) & np.isfinite(self.chain.upper)
         middle = np.zeros(len(self.chain))
         middle[bounded] = (self.chain.lower + self.chain.upper)[bounded] / 2
@@ -405,7 +417,10 @@ class InverseKinematics:
 
 
 def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
-    """Return whether the Jacobian of the free joints has full rank at one of 8 configurations."""
+    """Whether the Jacobian of the free joints has full rank at one of 8 fixed configurations.
+
+    Full: its smallest singular value is `IMMOBILE` or more. ``held``: index from 0 -> rad or m.
+    """
     spread = np.sin(np.arange(8.0 * len(chain))).reshape(8, -1)
     spread[:, list(held)] = list(held.values())
     free = [i for i in range(len(chain)) if i not in held]

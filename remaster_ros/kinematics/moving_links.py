@@ -55,7 +55,10 @@ class MovingLinks:
         return cls(chain, frames, spin, turned, moved)
 
     def point_acceleration(self, points: FloatArray, link: int = -1) -> FloatArray:
-        """Acceleration of points (n, 3) of R that are fixed to a link, m/s², (n, 3)."""
+        """Acceleration of points (n, 3) of R that are fixed to a link, m/s², (n, 3).
+
+        ``points``: m, one for each configuration; ``link``: index from 0, -1 for the last.
+        """
         arm = points - self.frames[:, link, :3, 3]
         omega, alpha = self.angular_velocity[:, link], self.angular_acceleration[:, link]
         turning = np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))

@@ -35,7 +35,11 @@ class PadAngles:
 
     @classmethod
     def of(cls, controller: Controller | None, joint_names: Sequence[str]) -> PadAngles:
-        """Return the map of a controller; joints that it does not name have equal angles."""
+        """Return the map of a controller; joints that it does not name have equal angles.
+
+        None for the identity. ``joint_names``: of the URDF's k joints. Raises ValueError if a
+        coupling names another joint, IndexError if couplings go in a circle (`coupled_in_circle`).
+        """
         k = len(joint_names)
         matrix, zero = np.eye(k), np.zeros(k)
         joints = {} if controller is None else controller.joints
@@ -68,7 +72,10 @@ class PadAngles:
         return offsets @ self.from_urdf.T
 
     def coupled(self, joint: int) -> tuple[int, ...]:
-        """Return the indices of the joints whose pad angles are added to that of a joint."""
+        """Return the indices of the joints whose pad angles are added to that of a joint.
+
+        From 0, ascending; () if there are none.
+        """
         return tuple(j for j in np.flatnonzero(self.matrix[joint]).tolist() if j != joint)
 
 

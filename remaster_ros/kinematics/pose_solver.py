@@ -156,14 +156,15 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def wrapped(angles: FloatArray) -> FloatArray:
-    """Return angles shifted by whole turns into [-pi, pi]."""
+    """Return angles, rad, shifted by whole turns into [-pi, pi]; both ends occur."""
     return angles - 2 * np.pi * np.round(angles / (2 * np.pi))
 
 
 def distinct(chain: SerialChain, q: FloatArray) -> tuple[FloatArray, IntArray]:
     """Return distinct configurations of q (m, k), modulo whole turns, and how often each occurs.
 
-    In order of first occurrence: rad or m, (n, k), and counts, (n,). Tolerance: `DISTINCT`.
+    In order of first occurrence: rad or m, (n, k), and counts, (n,). Tolerance of each joint:
+    `DISTINCT`; of a prismatic one `per_radian` times as much, without turns.
     """
     gaps = q[:, None] - q[None]
     gaps = np.abs(np.where(chain.slides, gaps, wrapped(gaps)))

@@ -26,10 +26,10 @@ TURN_RAD = 1e-4
 def difference(chain: SerialChain, description: str) -> str:
     """Return in words how a description contradicts an arm; '' if it does not.
 
-    The position of the first joint is compared if the description has the arm's base link, the tip
-    if it has the arm's tip link. Limits of the description may be wider than the arm's.
-
-    ``chain``: the arm; ``description``: URDF text.
+    Axes are compared with all joints at zero, within `PLACE_M` and `TURN_RAD`; the position of the
+    first joint if the description has the arm's base link, the tip if it has the arm's tip link.
+    Limits of the description may be wider than the arm's. Text that is no URDF is a contradiction
+    too. ``chain``: the arm; ``description``: URDF text.
     """
     read = _read(chain, description)
     if isinstance(read, str):
@@ -80,7 +80,7 @@ def axes_apart(chain: SerialChain, description: str) -> float:
 def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool] | str:
     """Return a description's arm, whether it has base and tip link; or why it is another.
 
-    Text that says why the description is of another arm, if it is.
+    The reason, as text, if it is invalid, lacks a joint, or has the joints in another order.
     """
     try:
         model = parse_urdf(description)
@@ -122,8 +122,10 @@ def _from(chain: SerialChain, base: bool) -> FloatArray:
 
 
 def _degrees(angle_rad: float) -> str:
+    """Return an angle, rad, as text in degrees: '1.23 deg'."""
     return f'{np.rad2deg(angle_rad):.2f} deg'
 
 
 def _millimetres(way_m: float) -> str:
+    """Return a way, m, as text in millimetres: '1.23 mm'."""
     return f'{1e3 * way_m:.2f} mm'

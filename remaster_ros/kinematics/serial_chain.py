@@ -175,7 +175,10 @@ class SerialChain:
         return np.maximum(self.lower, -turn), np.minimum(self.upper, turn)
 
     def shown_limits(self, joint: int) -> str:
-        """Return the limits of a joint as text in its displayed unit, which is left out."""
+        """Return the limits of a joint as text in deg or mm, without the unit: '-90 to 90'.
+
+        ``joint``: index from 0; an infinite limit is 'without end'.
+        """
         factor, ends = self.shown_scale[joint], (self.lower[joint], self.upper[joint])
         return ' to '.join(f'{factor * e:.0f}' if np.isfinite(e) else 'without end' for e in ends)
 
@@ -192,7 +195,7 @@ class SerialChain:
         """Return the chain with zero-offsets (rad or m, (k,)) built into its fixed transforms.
 
         Its `frames` take reported joint angles and give true frames; its limits are those of the
-        reported angles.
+        reported angles: the given ones minus the offsets.
         """
         T_fixed = self.T_fixed.copy()
         T_fixed[:-1] = T_fixed[:-1] @ self.motions(np.asarray(joint_offsets, dtype=float))
@@ -204,9 +207,10 @@ class SerialChain:
         )
 
     def within_limits(self, q: ArrayLike, tolerance: float | FloatArray = 0.0) -> BoolArray:
-        """Return whether all joints of configurations q (..., k) are within their limits, (...).
+        """Whether all joints of configurations q (..., k) are within their limits, (...).
 
-        ``tolerance``: accepted distance beyond the limits, rad or m, one number or (k,).
+        ``tolerance``: accepted distance beyond the limits, rad or m, one number or (k,); negative
+        keeps a margin. NaN is outside.
         """
         q = np.asarray(q, dtype=float)
         inside = (q >= self.lower - tolerance) & (q <= self.upper + tolerance)
@@ -232,7 +236,10 @@ class SerialChain:
         return frames
 
     def motions(self, q: FloatArray) -> FloatArray:
-        """Return the transform of each joint at positions q (..., k), (..., k, 4, 4)."""
+        """Return the transform of each joint at positions q (..., k), rad or m, (..., k, 4, 4).
+
+        It is the motion about or along the joint's axis alone, without `T_fixed`.
+        """
         vectors = q[..., None] * self.axes
         if not self.slides.any():
             return transform(rotation_vector_to_matrix(vectors), np.zeros(3))

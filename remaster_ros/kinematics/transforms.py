@@ -87,9 +87,9 @@ def mean_quaternion_xyzw(quaternions: ArrayLike) -> FloatArray:
 
 
 def inverse_poses(position: ArrayLike, xyzw: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the positions, m, (n, 3), and quaternions, (n, 4), of frame a in b.
+    """Return the positions, m, (n, 3), and quaternions x, y, z, w, (n, 4), of frame a in b.
 
-    ``position``, ``xyzw``: those of frame b in a.
+    ``position``, ``xyzw``: those of frame b in a; also one alone, (3,) and (4,).
     """
     back = Rotation.from_quat(np.asarray(xyzw, dtype=float)).inv()
     return np.asarray(-back.apply(np.asarray(position, dtype=float))), np.asarray(back.as_quat())
@@ -101,7 +101,10 @@ def matrix_from_rpy(rpy: ArrayLike) -> FloatArray:
 
 
 def with_z_along(direction: ArrayLike) -> FloatArray:
-    """Return a rotation (3, 3) whose z axis lies along a direction (3,) of any length but zero."""
+    """Return a rotation (3, 3) whose z axis lies along a direction (3,) of any length but zero.
+
+    Its x axis is across, and otherwise arbitrary; the same for the same direction.
+    """
     z = np.asarray(direction, dtype=float) / np.linalg.norm(direction)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)
     x /= np.linalg.norm(x)

@@ -261,7 +261,10 @@ def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
 
 
 def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
-    """Return the transform of the <origin> of an element, (4, 4); the identity if it has none."""
+    """Return the transform of the <origin> of an element, (4, 4); the identity if it has none.
+
+    ``where``: for messages. Raises InputError if xyz (m) or rpy (rad) is malformed.
+    """
     origin = element.find('origin')
     if origin is None:
         return np.eye(4)
@@ -279,7 +282,10 @@ def attribute(element: ElementTree.Element, key: str, where: str) -> str:
 
 
 def numbers(text: str, count: int, what: str) -> FloatArray:
-    """Return the `count` numbers in a text, (count,); raise InputError, which names `what`."""
+    """Return the `count` numbers in a text, (count,); `what` names them in messages.
+
+    Raises InputError if they are more or fewer, or one is not finite or above `_LARGEST`.
+    """
     parts = text.split()
     if len(parts) != count:
         needed = 'three numbers are needed' if count == 3 else f'{count} is needed'
@@ -294,7 +300,10 @@ def _optional_number(element: ElementTree.Element, key: str, where: str) -> floa
 
 
 def _number(text: str, what: str, largest: float = _LARGEST) -> float:
-    """Return text as a finite number; raise InputError, which names `what`."""
+    """Return text as a finite number; raise InputError, which names `what`, if it is none.
+
+    ``largest``: largest absolute value.
+    """
     try:
         value = float(text)
     except ValueError:

@@ -79,7 +79,10 @@ def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
 
 
 def mesh_names(text: str) -> list[str]:
-    """Return the file names of all collision meshes, as written, without repeats."""
+    """Return the file names of all collision meshes, as written, without repeats, in file order.
+
+    Raises InputError as `link_shapes`.
+    """
     names: list[str] = []
     link_shapes(text, names.append)
     return list(dict.fromkeys(names))
@@ -149,7 +152,8 @@ def _carriers(text: str, chain: SerialChain) -> Callable[[str], tuple[int, Float
 def chain_visuals(text: str, chain: SerialChain) -> list[Visual]:
     """Return the visual elements of URDF text (which `parse_urdf` accepts), for pictures.
 
-    ``text``: the URDF that the chain was read from.
+    ``text``: the URDF that the chain was read from. An element that cannot be read has neither
+    shape nor mesh; no error is raised for it.
     """
     carrier, robot = _carriers(text, chain), ElementTree.fromstring(text)
     colors = {element.get('name', ''): _color(element) for element in robot.findall('material')}

@@ -29,8 +29,10 @@ class ClockMapping:
     def capture_time(self, device_s: float, age_s: float, received_s: float) -> float:
         """Time of capture of a reading by the receiver's clock, s.
 
-        ``device_s``: capture by the device's clock, s; ``age_s``: delay reported by the device, s;
-        ``received_s``: arrival by the receiver's clock, s.
+        The offset is the least (of a simulated clock the median) of the last readings, this one
+        included; a device's clock that goes back begins anew. ``device_s``: capture by the
+        device's clock, s; ``age_s``: delay reported by the device, s; ``received_s``: arrival by
+        the receiver's clock, s.
         """
         if self._last_device_s is not None and device_s < self._last_device_s:
             # The device's clock was restarted: offsets to the former clock are void.

@@ -89,14 +89,14 @@ class Driver(ABC):
 
     @abstractmethod
     def open(self) -> None:
-        """Connect; called again after a `DeviceError`."""
+        """Connect, or raise DeviceError with the remedy; called again after that."""
 
     @abstractmethod
     def close(self) -> None:
         """Disconnect; may be repeated, and called while another thread reads or measures."""
 
     def state(self) -> SensorState:
-        """Present state of the device; called from any thread."""
+        """Present state of the device; called from any thread. By default it is ready."""
         return SensorState()
 
 
@@ -163,7 +163,8 @@ class TriggeredDriver(Driver):
         """
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Prepare for the next request; called when the arm has arrived.
+        """Prepare for the next request; called when the arm has arrived. By default nothing.
 
-        A `DeviceError` raised here is shown, and the request is made all the same.
+        ``expected``: as in `measure`. A `DeviceError` raised here is shown, and the request is
+        made all the same.
         """

@@ -194,9 +194,9 @@ class TrackerLink:
             self.counts[what] += times
 
     def open(self, timeout_s: float) -> None:
-        """Connect within `timeout_s` of wall time, unless connected.
+        """Connect within `timeout_s` of wall time, unless connected, and start the reading thread.
 
-        Raises LaserTrackerError if the instrument cannot be reached.
+        Raises LaserTrackerError, without a status, if the instrument cannot be reached.
         """
         if self.connected:
             return
@@ -228,7 +228,10 @@ class TrackerLink:
         self._thread.start()
 
     def close(self, reason: str = 'closed by this program') -> None:
-        """Close the connection; a command that waits for its reply fails with the reason."""
+        """Close the connection, and wait for the reading thread; again does nothing.
+
+        A command that waits for its reply fails with the reason.
+        """
         self._lose(reason)
         with self._news:
             connection, self._socket = self._socket, None
@@ -243,11 +246,12 @@ class TrackerLink:
     def ask(
         self, command: Command, *values: Value, timeout_s: float, what: str = ''
     ) -> tuple[Value, ...]:
-        """Send a command; the values of its reply are returned.
+        """Send a command; the values of its reply are returned, in the order of its layout.
 
-        ``timeout_s``: by the injected clock, s, but at least 2 s of wall time; ``what``: the
-        command in words, for messages. Raises LaserTrackerError if the instrument refuses, is
-        busy, does not answer or is not connected.
+        ``timeout_s``: by the injected clock, s, but at least 2 s of wall time (or itself, if
+        shorter); ``what``: the command in words, for messages. Raises LaserTrackerError if the
+        instrument refuses, is busy, does not answer (the connection is closed then) or is not
+        connected.
         """
         what = what or command.name.replace('_', ' ').lower()
         with self._exchange_of(command, what, timeout_s) as exchange:
@@ -270,7 +274,11 @@ class TrackerLink:
 
     @contextlib.contextmanager
     def _exchange_of(self, command: Command, what: str, timeout_s: float) -> Iterator[_Exchange]:
-        """Exchange of one command and its answers, with the instrument reserved."""
+        """Context of one command and its answers, with the instrument reserved.
+
+        Raises LaserTrackerError (`Status.SERVER_BUSY`) if another command is under way. Packets
+        that are left at the end are counted as unexpected.
+        """
         if not self._one_at_a_time.acquire(blocking=False):
             raise LaserTrackerError(
                 f'{self.name}: busy with the {self._asking or "last command"} when asked for '
@@ -312,7 +320,11 @@ class TrackerLink:
             self._count_unexpected(event, exchange)
 
     def _next(self, exchange: _Exchange) -> Reply | ErrorReport | Measurement:
-        """Next packet that may belong to the exchange."""
+        """Next packet that may belong to the exchange, waited for.
+
+        Raises LaserTrackerError if the connection is lost, or the exchange late (it is closed
+        then).
+        """
         with self._news:
             while not self._inbox:
                 if self._lost:
@@ -329,7 +341,7 @@ class TrackerLink:
     ) -> None:
         """Count and drop a packet that does not belong to the exchange.
 
-        Raise if it is its error.
+        Raises LaserTrackerError if it is the exchange's error report, or the exchange is late.
         """
         if isinstance(event, ErrorReport) and event.command in (exchange.command, Command.UNKNOWN):
             self._check(event.status or Status.NO_STATIONARY_RESULT, exchange.what)
@@ -347,6 +359,10 @@ class TrackerLink:
         )
 
     def _deadline(self, timeout_s: float) -> Callable[[], bool]:
+        """Function that is true once a time-out is over, by the injected clock and in wall time.
+
+        ``timeout_s``: s from now; of wall time at most `_LEAST_WALL_S` of it are required.
+        """
         end, wall_end = self._now() + timeout_s, time.monotonic() + min(timeout_s, _LEAST_WALL_S)
         return lambda: self._now() >= end and time.monotonic() >= wall_end
 
@@ -358,6 +374,7 @@ class TrackerLink:
             )
 
     def _lost_error(self, what: str) -> LaserTrackerError:
+        """Error of a command that a lost connection makes impossible, with the reason."""
         return LaserTrackerError(f'{self.name}: {what} impossible: {self._lost}; connect again')
 
     def _lose(self, reason: str) -> None:
@@ -367,7 +384,7 @@ class TrackerLink:
             self._news.notify_all()
 
     def _read(self, connection: socket.socket) -> None:
-        """Read until the connection ends; the function of the thread."""
+        """Thread: read packets until the connection ends; mark it as lost, with the reason."""
         reader = PacketReader('client')
         self._last_report = Status.ALL_OK
         reason = ''
@@ -508,7 +525,7 @@ class LaserTrackerClient:
         return self._link.counts.copy()
 
     def connect(self) -> None:
-        """Open the connection, unless it is open."""
+        """Open the connection, unless it is open, and request the status."""
         self._settings_checked = False
         self._link.open(self.settings.connect_timeout_s)
         try:
@@ -518,11 +535,11 @@ class LaserTrackerClient:
             raise
 
     def close(self) -> None:
-        """Close the connection; a command of another thread fails."""
+        """Close the connection; a command of another thread fails; again does nothing."""
         self._link.close()
 
     def request_status(self) -> TrackerStatus:
-        """Status of the instrument, requested now."""
+        """Status of the instrument, requested now; an unknown number counts as not ready."""
         (readiness,) = self._ask(Command.GET_TRACKER_STATUS, what='status')
         # A number that is no `Readiness` must not permit a measurement.
         self._status = _STATUS_OF_READINESS.get(readiness, TrackerStatus.NOT_READY)
@@ -553,16 +570,23 @@ class LaserTrackerClient:
         self._set_search()
 
     def _set_search(self) -> None:
+        """Send radius and time-out of a search to the instrument."""
         s = self.settings
         self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
 
     def find_reflector(self) -> None:
-        """Search in the present direction, at the last measured distance or 3 m, and lock."""
+        """Search in the present direction, at the last measured distance or 3 m, and lock.
+
+        The radius is `search_radius_m`. It counts as a failed search if none is found.
+        """
         distance = self._distance_m or 3.0
         self._search(Command.FIND_REFLECTOR, distance, what='search for the reflector')
 
     def go_position(self, position: ArrayLike) -> None:
-        """Turn to a position in the tracker's frame (m, (3,)), search there and lock."""
+        """Turn to a position in the tracker's frame (m, (3,)), search there and lock.
+
+        Raises InputError too, if it is not three finite numbers.
+        """
         target = self._point(position)
         self._distance_m = float(np.linalg.norm(target))
         self._search(Command.GO_POSITION, *target.tolist(), True, what='search at a position')
@@ -597,12 +621,12 @@ class LaserTrackerClient:
         ) from failure
 
     def measure(self, timeout_s: float | None = None) -> MarkerReading:
-        """Measure the locked reflector once.
+        """Measure the locked reflector once; reading with the stamp midway of the measurement.
 
         ``timeout_s``: None for the integration time and two reply time-outs. Raises
         LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
         `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is not
-        usable.
+        finite or beyond `FARTHEST_M`, or the settings were changed by another program.
         """
         if timeout_s is None:
             timeout_s = self.settings.integration_s + 2 * self.settings.reply_timeout_s
@@ -629,6 +653,7 @@ class LaserTrackerClient:
     def _ask(
         self, command: Command, *values: Value, what: str = '', timeout_s: float | None = None
     ) -> tuple[Value, ...]:
+        """Send a command as `TrackerLink.ask`; by default with `reply_timeout_s`."""
         timeout_s = self.settings.reply_timeout_s if timeout_s is None else timeout_s
         return self._link.ask(command, *values, timeout_s=timeout_s, what=what)
 
@@ -714,7 +739,7 @@ class LaserTrackerClient:
                 )
 
     def _changed(self, change: int) -> None:
-        """Record a status change; called in the reading thread."""
+        """Record a status change; called in the reading thread. Unknown changes are ignored."""
         if change in CHANGES_OF_READINGS:
             self._settings_checked = False
         status = _STATUS_OF_CHANGE.get(change)

@@ -86,7 +86,7 @@ class LaserTrackerDriver(TriggeredDriver):
         self.tracker.close()
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Search once if the beam is broken."""
+        """Search once if the beam is broken. Raises LaserTrackerError if none is found."""
         if self.tracker.status is not TrackerStatus.READY:
             before, self._on = self._on, None
             searches = self._lock(expected)
@@ -122,13 +122,20 @@ class LaserTrackerDriver(TriggeredDriver):
             self._narrow = True
 
     def _lock(self, expected: FloatArray | None) -> int:
-        """Lock the reflector if the beam is broken; number of searches."""
+        """Lock the reflector if the beam is broken, by one search; number of searches made.
+
+        Raises LaserTrackerError if it is not found.
+        """
         if expected is not None:
             self._search_narrowly()
         return self.tracker.ensure_locked(expected, attempts=1)
 
     def measure(self, expected: FloatArray | None) -> MarkerReading:
-        """Measure the reflector at the expected position; see `TriggeredDriver.measure`."""
+        """Measure the reflector at the expected position; see `TriggeredDriver.measure`.
+
+        `attempts` times at most. A reading further than `max_deviation_m` from there counts as
+        failed; the last failure is raised, a lost connection at once.
+        """
         failure: DeviceError | None = None
         for _ in range(self.p.attempts):
             try:
@@ -151,7 +158,7 @@ class LaserTrackerDriver(TriggeredDriver):
         raise failure
 
     def state(self) -> SensorState:
-        """Lock, counts, and last temperature."""
+        """Lock, counts, and last temperature, °C, if there was one; always ready."""
         values: dict[str, Any] = {'lock': self.tracker.status.value, **self.tracker.counts}
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c

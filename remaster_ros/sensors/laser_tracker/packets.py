@@ -209,7 +209,10 @@ _MEANING: dict[int, tuple[str, str]] = {
 
 
 def describe_status(status: int) -> str:
-    """Status as name, number, meaning and remedy, for one line of text."""
+    """Status as name, number, meaning and remedy, for one line of text.
+
+    An unknown number refers to the instrument's manual.
+    """
     try:
         name = Status(status).name.replace('_', ' ').lower()
     except ValueError:
@@ -420,7 +423,7 @@ class PacketReader:
             self._at_end = True
 
     def next_event(self) -> Event | NeedData:
-        """Next event, or `NEED_DATA`.
+        """Next event, or `NEED_DATA` while it is incomplete; ConnectionClosed at the end.
 
         Raises ProtocolError if the packet does not fit its layout; it is dropped, and the next
         call continues after it. If the size of a packet is impossible, or the peer closed within a
@@ -516,7 +519,10 @@ def _decode_result(body: bytes) -> Measurement:
 
 
 def _flat(result: Measurement) -> Iterator[float]:
-    """Inverse of `_decode_result`: three numbers for a field with one number per coordinate."""
+    """Numbers of a measurement in the order of its packet, the inverse of `_decode_result`.
+
+    Three for a field with one number per coordinate, one for others.
+    """
     for field in fields(result):
         value = getattr(result, field.name)
         yield from value if field.name in _TRIPLES else (value,)

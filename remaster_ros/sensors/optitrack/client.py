@@ -121,7 +121,11 @@ class NatNetClient(MarkerFollower):
                 self._digest_backlog()
 
     def _send_due_requests(self, now: float) -> None:
-        """Send the requests that are due."""
+        """Send the requests that are due at `now`, `time.monotonic`, s.
+
+        CONNECT while frames or the answer are missing, the wanted bitstream, KEEPALIVE in unicast,
+        the model's description if it is wanted.
+        """
         silent = (
             self._status.server is None
             or self._frame_at is None
@@ -254,7 +258,10 @@ class NatNetClient(MarkerFollower):
             self._hand_on(sample)
 
     def _take_answer(self, message: Message) -> None:
-        """Process an answer on the command channel."""
+        """Process an answer on the command channel, by its type.
+
+        A server that disconnects counts as unanswered; other kinds are ignored.
+        """
         if isinstance(message, ServerInfo):
             self._take_server(message)
         elif isinstance(message, ModelDefinition):
@@ -269,7 +276,10 @@ class NatNetClient(MarkerFollower):
                 self._status.server = None
 
     def _take_server(self, server: ServerInfo) -> None:
-        """Process an answer to CONNECT: request the model, negotiate a wanted bitstream."""
+        """Process an answer to CONNECT: request the model, negotiate a wanted bitstream.
+
+        Frames may get the lock from then on; without a wanted bitstream the server's own is read.
+        """
         self._status.server = server
         self._lock.answer()
         self._status.port_closed = False
@@ -293,7 +303,11 @@ class NatNetClient(MarkerFollower):
         self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
 
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
-        """Process the answer to the request of `_negotiate`; None if it was refused."""
+        """Process the answer to the request of `_negotiate`; None if it was refused.
+
+        The version becomes the answered one, the wanted one for the code 0, else the server's own.
+        Ignored if no answer is awaited.
+        """
         if self._status.server is None or self._status.version is not None:
             return
         self._status.version = self._status.server.natnet_version

@@ -79,7 +79,10 @@ class OptiTrackDriver(StreamDriver):
         """Do nothing: the client of the constructor keeps trying by itself."""
 
     def read(self) -> MarkerReading | None:
-        """Next measured position; see `StreamDriver.read`."""
+        """Next measured position; None without one in `WAIT_S`; see `StreamDriver.read`.
+
+        None also before a simulated clock has begun.
+        """
         try:
             sample = self._samples.get(timeout=WAIT_S)
         except queue.Empty:
@@ -97,7 +100,7 @@ class OptiTrackDriver(StreamDriver):
         return MarkerReading(self._captured_s, sample.position, marker=sample.marker)
 
     def state(self) -> SensorState:
-        """State by the received and the missing frames."""
+        """State by the received and the missing frames; ready if only the marker is hidden."""
         status = self.client.status()
         diagnosis = self.client.diagnosis()
         values = {

@@ -90,7 +90,11 @@ class SourceLock:
         self._answered = True
 
     def release_if_silent(self, now_s: float) -> bool:
-        """Release the lock after a silence of its source; True if it was released now."""
+        """Release the lock after a silence of its source; True if it was released now.
+
+        A silence is more than `silence_s` without a whole frame; then an answer is needed for a
+        new lock.
+        """
         if self.source is None or now_s - self._last_frame_s <= self._silence_s:
             return False
         self.source = None
@@ -98,7 +102,10 @@ class SourceLock:
         return True
 
     def is_refused(self, source: Source, now_s: float) -> bool:
-        """Whether all datagrams of this source are ignored; records that it sent."""
+        """Whether all datagrams of this source are ignored; records that it sent.
+
+        They are while another source has the lock, and for `REFUSED_FOR_S` if it sent beside one.
+        """
         if source == self.source:
             return False
         if self.source is not None:
@@ -111,7 +118,11 @@ class SourceLock:
         return True
 
     def judge(self, source: Source, now_s: float) -> SourceVerdict:
-        """Verdict on a whole frame; its source gets the lock if it is due."""
+        """Verdict on a whole frame at `now_s`, s; its source gets the lock if it is due.
+
+        It is due for the last holder at once; for another one after an answer, with
+        `PROBATION_FRAMES` frames in `PROBATION_S` as the only source.
+        """
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN
         if source == self.source:
@@ -135,7 +146,10 @@ class SourceLock:
         return SourceVerdict.BELIEVED
 
     def rivals(self, now_s: float) -> tuple[Source, ...]:
-        """Refused sources that sent lately, while or after another had the lock."""
+        """Refused sources that sent lately, while or after another had the lock.
+
+        Lately is in the last `REFUSED_FOR_S`; ``now_s``: s.
+        """
         return tuple(
             source
             for source, other in list(self._others.items())
@@ -303,12 +317,15 @@ class MarkerGate:
         return self._choice.lone_marker or self.counts.marker_id is not None
 
     def forget_assets(self) -> None:
-        """Discard the server's rigid bodies."""
+        """Discard the server's rigid bodies: the id is that of the choice, or unknown."""
         self.counts.marker_id = None if self._choice.lone_marker else self._choice.marker_id
         self.counts.problem = '' if self.resolved else 'the server has not named its rigid bodies'
 
     def name_assets(self, assets: Mapping[str, int]) -> None:
-        """Find the marker's id among the rigid bodies that the server streams, id by name."""
+        """Find the marker's id among the rigid bodies that the server streams, id by name.
+
+        If it is not found, `counts.problem` says why. A given id or a lone marker is kept.
+        """
         self.forget_assets()
         if self.resolved:
             return
@@ -329,11 +346,11 @@ class MarkerGate:
             )
 
     def drop(self, reason: Dropped) -> None:
-        """Count a datagram dropped before it became a frame."""
+        """Count a datagram dropped before it became a frame, by its reason."""
         self.counts.dropped[reason] += 1
 
     def pass_over(self, reason: Dropped) -> None:
-        """Count a whole frame that is not examined and compared with no other."""
+        """Count a whole frame that is not examined, and compared with no other, by its reason."""
         self.counts.frames += 1
         self.counts.dropped[reason] += 1
         self.counts.last_reason = reason
@@ -366,7 +383,10 @@ class MarkerGate:
         return reading
 
     def disown(self, reason: Dropped) -> None:
-        """Withdraw the last reading, with a reason."""
+        """Withdraw the last accepted reading, counted with a reason.
+
+        The next reading is compared with none before.
+        """
         self.counts.accepted -= 1
         self.counts.dropped[reason] += 1
         self.counts.last_reason = reason
@@ -400,7 +420,10 @@ class MarkerGate:
         return None
 
     def _find(self, frame: Frame) -> LabeledMarker | Dropped:
-        """The marker in a frame, or the reason why not; never occluded or model-filled."""
+        """The marker in a frame, or the reason why not; never occluded or model-filled.
+
+        Of a lone marker the only one measured, labelled or not. Sets `counts.labels`.
+        """
         self.counts.labels = tuple(marker.id for marker in frame.labeled_markers[:8])
         if self._choice.lone_marker:
             found = [m for m in frame.labeled_markers if not m.params & (OCCLUDED | MODEL_FILLED)]
@@ -449,6 +472,7 @@ class MarkerGate:
 
 
 def _implausible(reading: MarkerSample) -> Dropped | None:
+    """`Dropped.IMPLAUSIBLE` beyond `FARTHEST_M` or older than `MAX_AGE_S`; else None."""
     near = np.max(np.abs(reading.position)) <= FARTHEST_M
     return None if near and reading.age_s <= MAX_AGE_S else Dropped.IMPLAUSIBLE
 

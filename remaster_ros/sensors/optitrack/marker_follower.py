@@ -88,7 +88,11 @@ HEALTHY = Diagnosis('none', '')
 
 
 def diagnose(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
-    """Reason why readings are missing; `HEALTHY` if they are not."""
+    """Reason why readings are missing, with the remedy; `HEALTHY` if they are not.
+
+    In this order: no answer, version, several sources, no frames for `silence_s`, no such rigid
+    body, no reading for `silence_s`.
+    """
     if status.server is None:
         return _unanswered(status, settings)
     version = status.version or status.server.natnet_version
@@ -219,7 +223,7 @@ def _refused(status: StreamStatus) -> str:
 
 
 def warning(status: StreamStatus) -> str:
-    """Other programs that send frames while readings come; '' if none does."""
+    """Text on other programs that send frames while readings come; '' if none does."""
     others = [*status.rivals, *status.foreign]
     if not others or not status.source:
         return ''
@@ -302,9 +306,9 @@ class MarkerFollower(ABC):
         self._sample_at: float | None = None
 
     def start(self) -> None:
-        """Open the sockets and begin; the client keeps trying until `stop`.
+        """Open the sockets and begin; the client keeps trying until `stop`. Returns at once.
 
-        Raises DeviceError if a socket cannot be opened.
+        Raises DeviceError if the server's name is unknown, or a socket cannot be opened.
         """
         settings = self._settings
         self._status.server_ip = resolve(settings.server)
@@ -334,7 +338,7 @@ class MarkerFollower(ABC):
         self.stop()
 
     def status(self) -> StreamStatus:
-        """Snapshot of the counts and the server's answers."""
+        """Snapshot of the counts and the server's answers, with ages of now; from any thread."""
         now = time.monotonic()
         return replace(
             self._status,
@@ -352,7 +356,7 @@ class MarkerFollower(ABC):
         return {name: gate.counts for name, gate in self._further.items()}
 
     def diagnosis(self) -> Diagnosis:
-        """Fault and remedy if readings are missing."""
+        """Fault and remedy if readings are missing now; `HEALTHY` if they are not."""
         return diagnose(self.status(), self._settings)
 
     @abstractmethod
@@ -384,7 +388,10 @@ class MarkerFollower(ABC):
         return True
 
     def _release_silent_source(self) -> bool:
-        """Release the lock after a silence; the server must answer before the next lock."""
+        """Release the lock after a silence of its source, with a warning; whether it was released.
+
+        The server must answer before the next lock.
+        """
         holder = self._lock.source
         if holder is None or not self._lock.release_if_silent(time.monotonic()):
             return False
@@ -414,7 +421,11 @@ class MarkerFollower(ABC):
     def _take_whole_frame(
         self, frame: Frame, received_s: float, source: Source
     ) -> list[MarkerSample]:
-        """Readings of a completely decoded frame, which is counted."""
+        """Readings of a completely decoded frame, one for each marker; [] if none is visible.
+
+        A marker that is not visible is NaN if another one is. The frame is counted; one of a
+        source that is not believed (yet) has no readings.
+        """
         now = time.monotonic()
         before = self._lock.source
         verdict = self._lock.judge(source, now)
@@ -443,7 +454,10 @@ class MarkerFollower(ABC):
         return [replace(sample or hidden, marker=name) for name, sample in found.items()]
 
     def _begin_source(self, source: Source) -> None:
-        """Report the source whose frames are believed from now on."""
+        """Log the source whose frames are believed from now on.
+
+        If it is another one than before, its frames are compared with none of the other.
+        """
         before, self._believed_before = self._believed_before, source
         if before is not None and before != source:
             for gate in (self._gate, *self._further.values()):

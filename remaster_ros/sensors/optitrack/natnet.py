@@ -49,7 +49,7 @@ class ProtocolError(Exception):
 
 
 def require_supported(version: Version) -> None:
-    """Raises `ProtocolError` for a bitstream version that this decoder cannot read."""
+    """Raise ProtocolError for a bitstream version that is not read here: not 2.6 to 4.x."""
     if not (OLDEST_VERSION <= version < (5, 0)):
         raise ProtocolError(
             f'NatNet {version[0]}.{version[1]} is unknown here: 2.6 to 4.3 can be read'
@@ -75,19 +75,22 @@ class Reader:
         return self.end - self.offset
 
     def unpack(self, layout: Struct) -> tuple[Any, ...]:
-        """Read one struct."""
+        """Read one struct, and move behind it; ProtocolError beyond the end."""
         start = self.offset
         self.skip(layout.size)
         return layout.unpack_from(self._data, start)
 
     def rows(self, layout: Struct, count: int) -> list[tuple[Any, ...]]:
-        """Read `count` structs in a row."""
+        """Read `count` structs in a row; ProtocolError beyond the end."""
         start = self.offset
         self.skip(layout.size * count)
         return list(layout.iter_unpack(memoryview(self._data)[start : self.offset]))
 
     def count(self, item_bytes: int) -> int:
-        """Read an i32 count of items that take at least `item_bytes` each."""
+        """Read an i32 count of items that take at least `item_bytes` each.
+
+        Raises ProtocolError if it is negative, or the remaining bytes cannot hold as many.
+        """
         start = self.offset
         (count,) = self.unpack(_I32)
         if count < 0 or count * item_bytes > self.remaining_bytes:
@@ -97,7 +100,10 @@ class Reader:
         return count
 
     def text(self) -> bytes:
-        """Read the bytes of a text, without its NUL."""
+        """Read the bytes of a text, without its NUL, and move behind the NUL.
+
+        Raises ProtocolError if there is none within `MAX_TEXT_BYTES`, or before the end.
+        """
         start = self.offset
         stop = self._data.find(0, start, min(self.end, start + MAX_TEXT_BYTES))
         if stop < 0:
@@ -106,7 +112,7 @@ class Reader:
         return self._data[start:stop]
 
     def skip(self, size: int) -> None:
-        """Skip `size` bytes."""
+        """Skip `size` bytes; ProtocolError beyond the end or for a negative size."""
         stop = self.offset + size
         if not self.offset <= stop <= self.end:
             raise ProtocolError(
@@ -116,9 +122,9 @@ class Reader:
 
     @contextmanager
     def bounded(self, size: int) -> Iterator[None]:
-        """Context with the end after the next `size` bytes.
+        """Context with the end after the next `size` bytes; the cursor is behind them afterwards.
 
-        The cursor is behind them afterwards.
+        Raises ProtocolError if fewer are left.
         """
         if not 0 <= size <= self.remaining_bytes:
             raise ProtocolError(
@@ -167,6 +173,7 @@ class Codec(ABC):
 
 
 def _same(item: Any) -> Any:
+    """Return the item itself."""
     return item
 
 
@@ -192,7 +199,7 @@ class Row(Codec):
         self._build, self._flatten = build, flatten
 
     def read(self, reader: Reader) -> Any:
-        """Read one row."""
+        """Read one row; ProtocolError beyond the end."""
         return self._build([reader.unpack(self.layout)])[0]
 
     def skip(self, reader: Reader) -> None:
@@ -200,7 +207,7 @@ class Row(Codec):
         reader.skip(self.least)
 
     def write(self, item: Any) -> bytes:
-        """Write one row."""
+        """Bytes of one row; struct.error if a number does not fit."""
         return self.layout.pack(*self._flatten(item))
 
     def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
@@ -223,9 +230,11 @@ class _Text(Codec):
     least = 1
 
     def read(self, reader: Reader) -> str:
+        """Read a text; bytes that are not UTF-8 become U+FFFD, ProtocolError without a NUL."""
         return reader.text().decode('utf-8', 'replace')
 
     def skip(self, reader: Reader) -> None:
+        """Skip a text with its NUL; ProtocolError without one."""
         reader.text()
 
     def write(self, item: str) -> bytes:
@@ -300,7 +309,7 @@ class Columns(Codec):
             kind.skip_many(reader, count)
 
     def write(self, item: Sequence[Sequence[Any]]) -> bytes:
-        """Write the columns, which are equally long."""
+        """Bytes of the columns; there must be one, and all equally long."""
         columns = [map(kind.write, column) for kind, column in zip(self._kinds, item)]
         return _COUNT.pack(len(item[0])) + b''.join(chain(*columns))
 
@@ -348,7 +357,7 @@ class SizedList(List):
         return count, size
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
-        """Read the items."""
+        """Read the items; ProtocolError if they do not fill the size exactly."""
         count, size = self._head(reader)
         if size != count * self.kind.least:
             raise ProtocolError(
@@ -357,7 +366,10 @@ class SizedList(List):
         return self.kind.read_many(reader, count)
 
     def skip(self, reader: Reader) -> None:
-        """Skip the items at once."""
+        """Skip count, size and items at once, by the size: no item is read.
+
+        Raises ProtocolError as `_head`.
+        """
         reader.skip(self._head(reader)[1])
 
     def write(self, item: Sequence[Any]) -> bytes:
@@ -518,12 +530,17 @@ def _layout(version: Version) -> _Layout:
 
 
 def _require_finite(values: Iterable[float], what: str) -> None:
+    """Raise ProtocolError, which names `what`, if a value is not finite."""
     if not all(map(math.isfinite, values)):
         raise ProtocolError(f'the {what} is not finite')
 
 
 def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
-    """Labelled markers of rows; the sum of all numbers shows whether one is not finite."""
+    """Labelled markers of rows of numbers, in order.
+
+    Raises ProtocolError if the position of a marker that is not occluded is not finite; the sum of
+    all numbers shows whether any is not.
+    """
     # The named tuple's own constructor would take as long as decoding the rest of the frame.
     make = tuple.__new__
     if has_residual:
@@ -544,14 +561,17 @@ def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
 
 
 def _flat_labeled_2(marker: LabeledMarker) -> tuple:
+    """Numbers of a labelled marker in NatNet 2: id, position, size, flags."""
     return marker.id, *marker.position, marker.size, marker.params
 
 
 def _flat_labeled_3(marker: LabeledMarker) -> tuple:
+    """Numbers of a labelled marker from NatNet 3 on: those of 2, and the residual (or NaN)."""
     return *_flat_labeled_2(marker), math.nan if marker.residual is None else marker.residual
 
 
 def _flat_body_3(body: RigidBody) -> tuple:
+    """Numbers of a rigid body from NatNet 3 on: id, position, x, y, z, w, error, flags."""
     return body.id, *body.position, *body.orientation_xyzw, body.mean_error, body.params
 
 
@@ -968,12 +988,15 @@ def encode_connect_request(name: str, wanted_version: Version | None = None) -> 
 
 
 def encode_command_request(command: str) -> bytes:
-    """REQUEST with a command such as ``FrameRate`` or ``Bitstream,4.1``."""
+    """REQUEST with a command such as ``FrameRate`` or ``Bitstream,4.1``.
+
+    Raises ValueError if it has a NUL or over 255 bytes.
+    """
     return join_datagram(MessageId.REQUEST, TEXT.write(command))
 
 
 def encode_echo_request(clock: int) -> bytes:
-    """ECHOREQUEST with the client's clock, any unsigned 64-bit number."""
+    """ECHOREQUEST with the client's clock, an unsigned 64-bit number; struct.error for another."""
     return join_datagram(MessageId.ECHOREQUEST, _CLOCK.write(clock))
 
 
@@ -1001,6 +1024,7 @@ def _known(version: Version | None) -> Version:
 
 
 def _text(payload: bytes) -> str:
+    """UTF-8 text up to the first NUL, or to the end; invalid bytes become U+FFFD."""
     return payload.partition(b'\0')[0].decode('utf-8', 'replace')
 
 
@@ -1013,7 +1037,10 @@ def _wanted_version(payload: bytes) -> Version | None:
 
 
 def _decode_server_info(payload: bytes) -> ServerInfo:
-    """Decode the answer to CONNECT; its connection is None before NatNet 3.0."""
+    """Decode the answer to CONNECT; its connection is None before NatNet 3.0.
+
+    Raises ProtocolError if the payload is too short; further bytes are ignored.
+    """
     reader = Reader(payload)
     name, *versions = reader.unpack(_SENDER)
     app_version, natnet_version = tuple(versions[:4]), (versions[4], versions[5])

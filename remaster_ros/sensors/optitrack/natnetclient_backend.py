@@ -72,7 +72,7 @@ class NatNetClientBackend(MarkerFollower):
         self._refusal = ''
 
     def diagnosis(self) -> Diagnosis:
-        """Fault and remedy if readings are missing."""
+        """Fault and remedy if readings are missing; 'version' for one that is not read."""
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:
@@ -108,9 +108,9 @@ class NatNetClientBackend(MarkerFollower):
             self._stopping.wait(POLL_S)
 
     def _greet(self) -> bool:
-        """Request the server's version with our decoder.
+        """Request the server's version with our decoder; whether natnetclient can read it.
 
-        Refuse versions that natnetclient cannot read.
+        False also without an answer in `POLL_S`; `diagnosis` has the reason.
         """
         request = natnet.encode_connect_request('remaster_ros')
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as command:
@@ -136,7 +136,11 @@ class NatNetClientBackend(MarkerFollower):
         return not self._refusal
 
     def _follow(self, client: Any) -> None:
-        """Read frames until the stream stops or natnetclient cannot read it any more."""
+        """Read frames until stopped or silent, or natnetclient cannot read them any more.
+
+        Silent for `silence_s`; `FAILURES_IN_A_ROW` failures of natnetclient. Readings on which
+        both decoders agree are handed on.
+        """
         self._name_assets({name: body.id for name, body in client.rigid_bodies.items()})
         source = client.data_sock._sock
         source.settimeout(POLL_S)
@@ -171,7 +175,10 @@ class NatNetClientBackend(MarkerFollower):
                 self._compare(sample, theirs)
 
     def _compare(self, sample: MarkerSample, markers: tuple[LabeledMarker, ...] | None) -> None:
-        """Pass the reading on if natnetclient has the same one: same frame, position and flags."""
+        """Pass the reading on if natnetclient has the same one: same position, no flags.
+
+        Else it is withdrawn (`Dropped.DISAGREEMENT`). ``markers``: None if natnetclient failed.
+        """
         if markers is not None and any(
             marker.position == tuple(sample.position) and not marker.params
             for marker in markers
@@ -183,7 +190,10 @@ class NatNetClientBackend(MarkerFollower):
 
 
 def _quiet_client() -> Any:
-    """Client class of natnetclient without its thread and its first wait of a minute."""
+    """Client class of natnetclient without its thread and its first wait of a minute.
+
+    Raises InputError if natnetclient is not installed.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore', SyntaxWarning)

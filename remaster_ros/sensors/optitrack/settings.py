@@ -84,11 +84,11 @@ def open_socket(
 
 
 def open_multicast_socket(group: str, port: int, interface: str) -> socket.socket:
-    """Data socket of a multicast client.
+    """Data socket of a multicast client, joined to the group on an interface.
 
-    Linux delivers a group's packets to sockets bound to the group's address (or to any), and none
-    to a socket bound to the interface's own address. Raises DeviceError if the port is in use, or
-    the interface cannot join the group.
+    ``interface``: IPv4 address of this machine's card. Linux delivers a group's packets to sockets
+    bound to the group's address (or to any), and none to a socket bound to the interface's own
+    address. Raises DeviceError if the port is in use, or the interface cannot join the group.
     """
     opened = open_socket(
         group, port, purpose='NatNet data', remedy='set data_port as in Motive', shared=True
@@ -108,7 +108,8 @@ def open_multicast_socket(group: str, port: int, interface: str) -> socket.socke
 def port_is_closed(server_ip: str, port: int, request: bytes) -> bool:
     """Whether the host answers that no program listens on the port.
 
-    Only a connected socket reports the "port unreachable" of such a host.
+    False if it answers or is silent for 0.2 s. Only a connected socket reports the "port
+    unreachable" of such a host. ``request``: datagram that is sent.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.settimeout(0.2)
@@ -202,7 +203,7 @@ class NatNetSettings:
 
 
 def require_group(group: str) -> None:
-    """Raises `InputError` unless the text is an IPv4 multicast group."""
+    """Raise InputError unless the text is an IPv4 multicast group."""
     try:
         is_group = IPv4Address(group).is_multicast
     except AddressValueError:

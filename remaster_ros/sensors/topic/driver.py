@@ -167,7 +167,7 @@ class TopicDriver(StreamDriver):
         self._publishers, self._on_tool = publishers, on_tool
 
     def open(self) -> None:
-        """Raises DeviceError if no node publishes the topic, or with another message type."""
+        """Check that a node publishes the topic, with its message type; else DeviceError."""
         if problem := self._unpublished():
             raise DeviceError(problem)
 
@@ -188,7 +188,12 @@ class TopicDriver(StreamDriver):
         )
 
     def take(self, message: Any) -> None:
-        """Process a message; called from any thread."""
+        """Process a message; called from any thread.
+
+        It becomes a reading for `read`, unless it is left out (`_refused`) or has no position;
+        both are counted. Its time of capture is its stamp, or its arrival by the parameter
+        `stamps`.
+        """
         found, now = READERS[self._type](message, self._marker), self._clock.now()
         arrival = self.p.stamps == 'arrival' or found.stamp_s == 0.0
         stamp_s = now if arrival else found.stamp_s
@@ -207,7 +212,12 @@ class TopicDriver(StreamDriver):
         self._readings.put((reading, now))
 
     def _refused(self, found: Sighting, stamp_s: float) -> tuple[str, str]:
-        """Reason why a message is left out, as a word and as a sentence; '' if it is not."""
+        """Reason why a message is left out, as a word and as a sentence; '' if it is not.
+
+        In this order: another frame, a stamp ahead or older than `max_age_s`, no orientation on
+        the tool, a stamp that does not advance (without a sentence: no fault). ``stamp_s``: time
+        of capture, s.
+        """
         if found.frame != self._frame:
             return 'other_frame', (
                 f'{self.topic} was in frame {self._frame!r} and is in {found.frame!r} now; one '
@@ -230,7 +240,7 @@ class TopicDriver(StreamDriver):
         return '', ''
 
     def read(self) -> MarkerReading | None:
-        """Next position; see `StreamDriver.read`."""
+        """Next position; None without one in `WAIT_S`; see `StreamDriver.read`."""
         try:
             reading, self.received_s = self._readings.get(timeout=WAIT_S)
         except queue.Empty:
@@ -238,7 +248,12 @@ class TopicDriver(StreamDriver):
         return reading
 
     def state(self) -> SensorState:
-        """State by the received messages."""
+        """State by the messages received, and by the publishers once silent for `SILENT_S`.
+
+        Not ready if a message was refused with a fault, the positions repeat (`FROZEN`), or the
+        topic is silent and has no publisher or always sends. A hidden marker, or a low rate, is a
+        trouble that leaves it ready.
+        """
         with self._lock:
             last_wall, counts = self._came_wall, dict(self._counts)
             trouble, hidden, age_s = self._trouble, self._hidden, self._age_s
@@ -304,7 +319,10 @@ def _rate_hz(recent: Sequence[MarkerReading]) -> float | None:
 
 
 def _std_m(recent: Sequence[MarkerReading]) -> float | None:
-    """Largest standard deviation of an axis, m: a measure of the marker's stillness."""
+    """Largest standard deviation of an axis, m: a measure of the marker's stillness.
+
+    None for fewer than two readings.
+    """
     if len(recent) < 2:
         return None
     return float(np.max(np.std([r.position for r in recent], axis=0, ddof=1)))
