@@ -30,7 +30,10 @@ class Bounds:
     remedy: str = ''
 
     def problem(self, key: str, value: float) -> str:
-        """Return the error of a value, in one line with the remedy; '' if valid."""
+        """Return the error of a value, in one line with the remedy; '' if valid.
+
+        ``key``: its name in the line. NaN and infinite values are errors.
+        """
         if not math.isfinite(value):
             return f'{key}: {value} is not a finite number; correct it'
         if self.least < value <= self.most or (value == self.least and not self.above):

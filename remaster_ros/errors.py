@@ -84,7 +84,10 @@ class DeviceError(RemasterError):
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """Return "; did you mean 'other'?" with the word that is most like it; '' where none is."""
+    """Return "; did you mean 'other'?" with the word that is most like it; '' if none is.
+
+    Upper and lower case count as the same; `difflib.get_close_matches` decides.
+    """
     by_folded = {known.casefold(): known for known in words}
     close = get_close_matches(word.casefold(), by_folded, 1)
     return f'; did you mean {by_folded[close[0]]!r}?' if close else ''

@@ -46,7 +46,8 @@ def svd(matrix: FloatArray, *, full_matrices: bool) -> tuple[FloatArray, FloatAr
     """Return the singular value decomposition, as of `numpy.linalg.svd`.
 
     LAPACK's divide and conquer does not converge for some finite matrices of hundreds of columns;
-    its older QR iteration does.
+    its older QR iteration does, and is taken then. Raises LinAlgError or ValueError if that fails
+    too.
     """
     try:
         left, singular, right = np.linalg.svd(matrix, full_matrices=full_matrices)

@@ -54,7 +54,7 @@ class Fit(FitResult):
         return _first_screen(fit_html(self, {}))
 
     def figures(self) -> dict[str, Figure]:
-        """Return the report's figures by name."""
+        """Return the report's figures by name; nothing is written."""
         from remaster_ros.reports.figures import as_figures, fit_figures
 
         return as_figures(fit_figures(self), self)
@@ -106,7 +106,7 @@ class Found(Discovery):
         return discovery_content(self)
 
     def figures(self) -> dict[str, Figure]:
-        """Return the report's figures by name."""
+        """Return the report's figures by name; nothing is written."""
         from remaster_ros.reports.figures import as_figures, discovery_figures
 
         return as_figures(discovery_figures(self), self)

@@ -59,7 +59,7 @@ def parameter_fields(kind: Any) -> dict[str, dataclasses.Field[Any]]:
 
 
 def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
-    """Return `value` as the field's type.
+    """Return `value` as the field's type; an int is converted for a float, nothing else.
 
     Parameters
     ----------
@@ -94,7 +94,11 @@ def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def check_all(owner: str, values: Any) -> None:
-    """Check every field of `values` that was made by `parameter`; errors as of `check`."""
+    """Check every field of `values` that was made by `parameter`; nothing is changed.
+
+    ``owner``: whose parameters they are, for the message. Raises InputError, which names owner and
+    field, for the first value of another type, out of range, or none of the choices.
+    """
     for name, field in parameter_fields(values).items():
         check(owner, field, getattr(values, name))
 

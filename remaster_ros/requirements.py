@@ -36,7 +36,10 @@ def missing_packages() -> str:
 
 
 def end_without_packages() -> None:
-    """End the program with one line if a package is missing."""
+    """End the program with one line on stderr if a package is missing.
+
+    Raises SystemExit with the status `WRONG_ENVIRONMENT`; nothing if none is missing.
+    """
     if message := missing_packages():
         print(message, file=sys.stderr)
         raise SystemExit(WRONG_ENVIRONMENT)

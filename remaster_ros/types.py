@@ -231,7 +231,7 @@ class Measurements:
 
     @classmethod
     def empty(cls, joints: int) -> Measurements:
-        """Return no observations of an arm with that many joints."""
+        """Return no observations, n = 0, of an arm with that many joints."""
         integers, numbers = np.zeros(0, np.int64), np.zeros(0)
         return cls(
             observation=integers,
@@ -321,12 +321,18 @@ class Correction:
 
     @property
     def is_inside(self) -> bool:
-        """Whether it is in the controller: the joint angles that this reports have it in them."""
+        """Whether it is in the controller: the joint angles that this reports have it in them.
+
+        The forms are pad, rising and ros2_control; False for an unknown form.
+        """
         return self.form in ('pad', 'rising', 'ros2_control')
 
     @property
     def is_beside(self) -> bool:
-        """Whether it is outside of the controller, whose joint angles are as without it."""
+        """Whether it is outside of the controller, whose joint angles are as without it.
+
+        The forms are that of the bridge, layer and urdf; False for an unknown form.
+        """
         return self.form in (BRIDGE, 'layer', 'urdf')
 
     def __str__(self) -> str:
@@ -334,7 +340,7 @@ class Correction:
 
 
 def _end(joint: ElementTree.Element, end: str) -> str:
-    """Return the link at an end of a joint, ``parent`` or ``child``."""
+    """Return the link at an end of a joint, ``parent`` or ``child``; '' if it has none."""
     found = joint.find(end)
     return '' if found is None else found.get('link', '')
 
@@ -435,7 +441,7 @@ class Session:
 
     @property
     def slides(self) -> tuple[bool, ...]:
-        """Which joints slide, base to tip: their positions are in m."""
+        """Whether each joint slides, base to tip, (k,): its positions are in m."""
         joints = ElementTree.fromstring(self.urdf).findall('joint')
         carrying = {_end(joint, 'child'): joint for joint in joints}
         kinds, link = list[str | None](), self.tip_link
@@ -512,7 +518,10 @@ class Session:
 
     @property
     def is_corrected(self) -> BoolArray:
-        """Where a correction was on, (n,); unknown rows of a session that states one count."""
+        """Whether a correction was on, (n,), row by row.
+
+        Unknown rows count as on if the session states a correction, else as off.
+        """
         given, unknown = self.measurements.correction, self.correction is not None
         if given is None:
             return np.full(len(self.measurements), unknown)
@@ -520,7 +529,11 @@ class Session:
 
     @property
     def correction_note(self) -> str:
-        """What zero-offsets of the reported angles are beside the correction; '' without one."""
+        """Sentence on what zero-offsets of the reported angles are beside the correction.
+
+        '' if no row has one on. For one in the controller they come on top, for one beside it they
+        take its place; for an unknown form it says what to state.
+        """
         on = self.is_corrected
         if not on.any():
             return ''
@@ -543,7 +556,7 @@ class Session:
         )
 
     def positions_alone(self) -> Session:
-        """Return the same without the measured orientations."""
+        """Return the session without the measured orientations."""
         without = replace(self.measurements, orientation=None)
         return replace(self, measurements=without, oriented=frozenset())
 
@@ -571,5 +584,8 @@ class Session:
         return replace(found, measurements=plain)
 
     def select(self, rows: BoolArray | IntArray) -> Session:
-        """Return this session with only the given rows."""
+        """Return this session with only the given rows (a mask or indices), in that order.
+
+        References stay; the checksum of the observations is '' then.
+        """
         return replace(self, measurements=self.measurements.select(rows), observations_sha256='')

@@ -51,7 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate offsets on a session, print a table, write JSON with --out."""
+    """Evaluate offsets on a session, print a table, write JSON with --out; return 0.
+
+    Raises InputError: a file is invalid, of another arm, or --out is another program's.
+    """
     session = read_to_fit(args.session)
     fit = read_fit(args.offsets)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
@@ -81,7 +84,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown_offsets(chain: SerialChain, offsets: FloatArray) -> dict[str, dict[str, float]]:
-    """Return the offsets by joint name, in degrees and, for prismatic joints, in mm."""
+    """Return the offsets by joint name, in degrees and, for prismatic joints, in mm.
+
+    ``joint_offsets_deg`` (empty if all joints slide), and ``joint_offsets_mm`` if any does.
+    """
     by_unit: dict[str, dict[str, float]] = {'joint_offsets_deg': {}}
     shown = (chain.shown_scale * offsets).tolist()
     for name, unit, value in zip(chain.joint_names, chain.shown_units, shown, strict=True):
@@ -90,7 +96,10 @@ def shown_offsets(chain: SerialChain, offsets: FloatArray) -> dict[str, dict[str
 
 
 def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:
-    """Warn if the offsets were fitted with another URDF."""
+    """Log a warning if the offsets were fitted with another URDF, by its SHA-256.
+
+    ``path``: of the offsets, for the message. Nothing if the fit states no robot.
+    """
     if fit.robot and fit.robot.urdf_sha256 != session.urdf_sha256:
         log.warning(
             "%s: fitted with another URDF than this session's; the joints have the same names, "
@@ -100,7 +109,10 @@ def warn_of_another_urdf(fit: Fit, session: Session, path: Path) -> None:
 
 
 def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
-    """Warn if the error is larger with the offsets than without."""
+    """Log a warning for each split whose mean error is larger with the offsets than without.
+
+    The error is that after registration; ``path``: of the offsets, for the message.
+    """
     for split, metrics in judged.accuracy.items():
         errors = {} if metrics is None else metrics['post_registration']
         if errors is None or errors.get('after') is None:
@@ -119,7 +131,7 @@ def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
 
 
 def table(judged: OffsetsJudgement) -> str:
-    """Return the metrics as text, one per line."""
+    """Return the metrics as text, one per line, then the observations left out."""
     lines = [f'{"mean error [95 % interval], mm":{WIDTH + 2}s} {"before":28s} after']
     for split, metrics in judged.accuracy.items():
         if metrics is None:
@@ -144,7 +156,10 @@ def table(judged: OffsetsJudgement) -> str:
 
 
 def interval(metric: dict[str, Any]) -> str:
-    """Return mean and interval of a metric as text."""
+    """Return mean and interval of a metric as text: '0.123 [0.100, 0.150]', in mm.
+
+    A metric of orientations is in degrees, and ends in 'deg'.
+    """
     if 'mean_deg' in metric:
         low, high = metric['interval95_deg']
         return f'{metric["mean_deg"]:.4f} [{low:.4f}, {high:.4f}] deg'

@@ -109,7 +109,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate all sessions without a row yet; then write the page."""
+    """Evaluate all sessions without a row yet; then write the page.
+
+    Returns 0 if any session has an answer, else 1. Raises InputError: the folder holds other
+    results, or the scheduler cannot be used.
+    """
     baseline = '' if args.baseline is None else str(args.baseline.resolve())
     folders = list(dict.fromkeys(folder.resolve() for folder in args.session))
     make_folder(args.out)
@@ -170,7 +174,10 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
-    """Return the job of a session; an unreadable file becomes the error of its row."""
+    """Return the job of a session; an unreadable file becomes the error of its row.
+
+    Its key is a checksum of version, seed, and the files that are read.
+    """
     made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
     files = sorted(
         path for path in folder.glob('*') if path.suffix in _READ or path.name == MANIFEST
@@ -197,7 +204,10 @@ def _digest(path: Path) -> str:
 
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
-    """Return the last row of each key; raise InputError if the journal is of something else."""
+    """Return the last row of each key, as recorded earlier.
+
+    Raises InputError, with the line, if the journal is of something else.
+    """
     rows_by_key = {}
     for line, row in enumerate(rows.records, 1):
         if row.get('format') != FORMAT or not isinstance(row.get('key'), str):
@@ -209,8 +219,9 @@ def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
 def worked(job: Job) -> dict[str, Any]:
     """Fit, discover and check a session in a worker; return the content of its row.
 
-    The results are those of the commands with this seed, whichever worker computes them. An error
-    becomes the status and text of the row.
+    ``status``: done, 'no answer' (the data do not allow one) or error, with its text in ``error``;
+    nothing is raised. The results are those of the commands with this seed, whichever worker
+    computes them.
     """
     try:
         return {'status': 'done', **_results(job)}
@@ -290,7 +301,10 @@ def _offset(offset: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_discovery(path: Path) -> dict[str, Any]:
-    """Return the columns of a discovery.json."""
+    """Return verdict, judgement and effects (sizes in mm) of a discovery.json.
+
+    Raises OSError, ValueError, KeyError or TypeError if it is unreadable or of another form.
+    """
     content = json.loads(path.read_bytes())
     return {
         'verdict': content['verdict'],
@@ -307,7 +321,10 @@ def _of_discovery(path: Path) -> dict[str, Any]:
 
 
 def _of_check(job: Job, session: Any) -> dict[str, Any]:
-    """Return the columns of a check against the baseline."""
+    """Return the columns of a check against the baseline, as `content_of`.
+
+    Raises InputError if the baseline is invalid or of another arm.
+    """
     from remaster_ros.cli.check import content_of, measured_of
     from remaster_ros.cli.verify import require_same_arm
     from remaster_ros.compensation.checking import SMALLEST_M, judge
@@ -334,9 +351,10 @@ def work_off(
 ) -> None:
     """Distribute jobs to workers until all have a row.
 
-    If a worker dies, all jobs under way are repeated one at a time, so that the row of the fatal
-    job says so. ``make``: creates the workers; ``ahead``: jobs under way at a time; ``finished``:
-    called with each job and its row.
+    ``work``: called in a worker; ``make``: creates the workers, again if they died; ``ahead``:
+    jobs under way at a time; ``finished``: called with each job and its row, in the order in which
+    they end. If a worker dies, all jobs under way are repeated one at a time; a job whose worker
+    died `KILLED` times has the row 'killed'. Another exception of `work` is raised.
     """
     waiting, deaths = list(reversed(jobs)), dict.fromkeys(map(id, jobs), 0)
     suspects: list[Any] = []
@@ -392,12 +410,15 @@ def work_off(
 
 
 def _died(error: Exception) -> bool:
-    """Return whether an error means that a worker process has ended."""
+    """Whether an error means that a worker process has ended, of this computer or of Dask."""
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == 'KilledWorker'
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:
-    """Return the worker processes of this computer."""
+    """Return the worker processes of this computer, spawned, each with one thread for BLAS.
+
+    Sets the environment of this process too.
+    """
     # What a worker starts with is set before; the latter two would go before the first.
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ[name] = '1'
@@ -407,7 +428,10 @@ def _pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this worker if its parent is killed."""
+    """End this worker with status 1 once its parent has ended, killed too; returns at once.
+
+    A daemon thread waits for that; children of a scheduler are not concerned.
+    """
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -453,7 +477,7 @@ def _scheduler(address: str, *, insecure: bool) -> Iterator[tuple[Executor, int]
 
 
 def _require_this_version(client: Any, address: str) -> None:
-    """Raise InputError if workers have another version of this package."""
+    """Raise InputError if workers have another version of this package, or none."""
     try:
         versions = client.run(_version)
     except Exception as error:
@@ -474,7 +498,10 @@ def _version() -> str:
 
 
 def _refuse_open(address: str, *, insecure: bool) -> None:
-    """Raise InputError for plain TCP to another computer, whose peer decides what is executed."""
+    """Raise InputError for plain TCP to another computer, whose peer decides what is executed.
+
+    Loopback addresses, ``tls://`` and `insecure` pass.
+    """
     parts = urllib.parse.urlsplit(address if '://' in address else f'tcp://{address}')
     host = parts.hostname or ''
     try:

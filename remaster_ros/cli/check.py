@@ -80,7 +80,8 @@ def run(args: argparse.Namespace) -> int:
     """Judge a session against the baseline, add it to the history, print the result; return 0.
 
     A session that cannot be judged is not added; the newest check of the history is judged again
-    without being added. Raises InputError for a session that is an older check.
+    without being added. Raises InputError for a session that is an older check, of another arm, or
+    measured moving, and for an invalid file.
     """
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     refuse_moving(session, args.session, 'check')
@@ -123,7 +124,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def measured_of(session: Session) -> Measured:
-    """Return the readings of a session as a check."""
+    """Return the readings of a session as a check; its time NaN if the session states none."""
     m = session.measurements
     return Measured(
         m.q,
@@ -160,7 +161,10 @@ def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> di
 
 
 def _require_history(path: Path) -> None:
-    """Refuse another file before it is opened, which drops what is no whole line of a journal."""
+    """Raise InputError for a file that is no history, before it is opened as a journal.
+
+    Opening drops what is no whole line. No file, and an empty or torn one, pass.
+    """
     start = format_record({'format': HISTORY})[: len(f'{{"format":"{HISTORY}"')]
     try:
         if path.exists() and not path.is_file():
@@ -224,7 +228,11 @@ def content_of(
     smallest_mm: float,
     iso: IsoFigures,
 ) -> dict[str, Any]:
-    """Return what was found, as it is printed as JSON; null where a number is not known."""
+    """Return what was found, as it is printed as JSON; null if a number is not known.
+
+    ``names``: of the sessions, oldest first; ``iso``: figures of the newest. Lengths are in mm,
+    angles in degrees, as the keys say; checks count from 1.
+    """
 
     def known(value: float, scale: float) -> float | None:
         return scale * float(value) if np.isfinite(value) else None
@@ -295,7 +303,7 @@ def _trend(found: CheckResult, joint_names: tuple[str, ...], names: list[str]) -
 
 
 def _next_date(found: CheckResult) -> str | None:
-    """Return the day of the next check, ISO 8601; None where the times are not known."""
+    """Return the day of the next check, ISO 8601, UTC; None if the times are not known."""
     if not (found.in_days and math.isfinite(found.when_s)):
         return None
     last = datetime.fromtimestamp(found.when_s, UTC)
@@ -312,7 +320,10 @@ def _next_in_words(found: CheckResult) -> str:
 
 
 def _span(found: CheckResult, trend: Trend) -> str:
-    """Return the duration of a trend, in words."""
+    """Return the duration of a trend in words: 'in 3 days', below 2 days in hours.
+
+    In checks if their times are not known.
+    """
     if not found.in_days:
         return f'in {counted(max(1, round(trend.span)), "check")}'
     if trend.span < 2.0:
@@ -323,7 +334,10 @@ def _span(found: CheckResult, trend: Trend) -> str:
 def _trend_in_words(
     found: CheckResult, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
 ) -> str:
-    """Return a change that is certain and no alarm, and when to look again, in sentences."""
+    """Return a change that is certain and no alarm, and when to look again, in sentences.
+
+    `found.trend` may not be None; ``names``: of the checks; ``smallest_mm``: change that matters.
+    """
     one = found.trend
     assert one is not None
     who = ' or '.join(
@@ -355,7 +369,10 @@ def in_words(
     names: list[str],
     smallest_mm: float = 1e3 * SMALLEST_M,
 ) -> str:
-    """Return what was found and what to do, in sentences."""
+    """Return what was found and what to do, in sentences, by the verdict.
+
+    ``names``: of the checks, oldest first; ``smallest_mm``: change at the tool that matters.
+    """
     if found.trend is not None:
         return _trend_in_words(found, joint_names, names, smallest_mm)
     unseen = [n for n, one in zip(joint_names, found.joints) if np.isnan(one.detectable_m)]
@@ -417,6 +434,7 @@ def in_words(
 
 
 def _named(found: CheckResult, names: list[str]) -> str:
+    """Check from which on it has changed, as text: number, from 1, and name."""
     since = found.since or 0
     return f'{since + 1} ({names[since]})'
 

@@ -69,9 +69,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Correct the table, write it, and print a summary.
+    """Correct the table, write it, and print a summary; return 0.
 
-    Raises InputError if joint columns or their units are not known.
+    Raises InputError if joint columns or their units are not known, a change or a command is
+    beyond its limits (`_refuse_beyond`), or --out is the table itself; nothing is written then.
     """
     compensation = read_compensation(args.compensation)
     if args.out.exists() and args.out.samefile(args.table):
@@ -116,12 +117,15 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str:
-    """Return a position or change of a joint with its unit."""
+    """Return a position or change of a joint, rad or m, in degrees or mm with its unit."""
     return chain.shown_offset(joint, value, digits).replace('deg', 'degrees')
 
 
 def _temperature(table: TextTable, columns: Columns, stated: float | None) -> FloatArray | None:
-    """Return the temperature of each row, degrees Celsius; None if unknown."""
+    """Return the temperature of each row, °C, (n,); None if unknown.
+
+    ``stated``: of the command line, which has precedence over the table's column.
+    """
     column = columns.first_of_kind('temperature')
     if stated is not None:
         return np.full(len(table.rows), stated)
@@ -137,7 +141,10 @@ def _refuse_beyond(
     compensator: Compensator,
     args: argparse.Namespace,
 ) -> None:
-    """Raise InputError for implausible changes, and commands beyond the joints' limits."""
+    """Raise InputError for implausible changes, and commands beyond the joints' limits.
+
+    Implausible is more than --max-change-deg. The first such row is named, with its line.
+    """
     chain, joints = compensator.model.chain, compensator.joint_names
     change, most = np.abs(result - given), np.radians(args.max_change_deg) * chain.per_radian
     for row, j in np.argwhere(change > most + ROUNDING_RAD)[:1]:
@@ -158,7 +165,11 @@ def _refuse_beyond(
 
 
 def _text(table: TextTable, columns: Columns, joints: FloatArray, digits: Sequence[int]) -> str:
-    """Return the table with other joint positions, everything else unchanged."""
+    """Return the table with other joint positions, everything else unchanged.
+
+    ``joints``: (n, k), in the units of the table; ``digits``: decimals of each. A separator that
+    is not one character becomes a comma.
+    """
     separator = table.separator if len(table.separator) == 1 else ','
     text = io.StringIO()
     writer = csv.writer(text, delimiter=separator, lineterminator='\n')
@@ -180,7 +191,11 @@ def _facts(
     done: Correction,
     times_s: FloatArray | None,
 ) -> dict[str, Any]:
-    """Return the summary as plain data."""
+    """Return the summary as plain data: changes, added speed, rows, residuals, in deg, mm and %.
+
+    ``wanted``: configurations at which the expected error is computed. Rows count from 1, without
+    the header; the added speed is None without increasing times.
+    """
     chain, joints = compensator.model.chain, compensator.joint_names
     shown = chain.shown_scale * np.abs(result - given).max(axis=0, initial=0.0)
     change: dict[str, dict[str, float]] = {'change_deg': {}}
@@ -211,7 +226,7 @@ def _facts(
 
 
 def _summary(facts: dict[str, Any], out: Path) -> str:
-    """Return the summary as text."""
+    """Return the summary of `_facts` as text, with the largest change in each unit."""
     residual, most = facts['residual_mm'], []
     for unit in ('deg', 'mm'):
         if of_joints := facts.get(f'change_{unit}'):

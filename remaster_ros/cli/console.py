@@ -55,7 +55,7 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
 
 
 def _duration(seconds: float) -> str:
-    """Return a time as text."""
+    """Return a time as text: seconds below 90 s, then minutes."""
     return f'{seconds:.0f} s' if seconds < 90.0 else f'{seconds / 60.0:.0f} min'
 
 

@@ -81,7 +81,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> NoReturn:
-    """Replace this process by that of the demo."""
+    """Replace this process by that of the demo; does not return.
+
+    Raises InputError if rclpy is not installed.
+    """
     out = Path(args.out) if args.out else free_folder()
     become(
         'demo',
@@ -104,8 +107,9 @@ def run(args: argparse.Namespace) -> NoReturn:
 def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
     """Return the parameters of the collection: cell and number of candidates.
 
-    An optimal design for the offsets keeps the fewest poses that a search for causes needs; a demo
-    that looks for causes has more of them.
+    ``candidates``: as given, None for none; ``hidden``: whether causes are looked for. An optimal
+    design for the offsets keeps the fewest poses that a search for causes needs; a demo that looks
+    for causes has more of them.
     """
     if candidates is None and not hidden:
         return {

@@ -53,9 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Search for causes, write the results, and print a short summary.
+    """Search for causes, write the results, and print a short summary; return 0.
 
-    An error of the session of --confirm is raised after everything else was written.
+    An error of the session of --confirm is raised after everything else was written. Raises
+    InputError: a file is invalid, or the sessions are the same; InsufficientDataError: the data do
+    not allow a search.
     """
     session, named = read_together(args.session)
     other = None if args.confirm is None else read_session(args.confirm)

@@ -81,7 +81,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _motor(text: str) -> tuple[str, MotorNumber]:
-    """Argument type: a joint and the numbers of its motor."""
+    """Argument type: a joint and the numbers of its motor, JOINT=OLD,COUNTS,DIRECTION.
+
+    Raises ArgumentTypeError for another form, counts not above 0, or a direction other than 1 and
+    -1.
+    """
     name, _, rest = text.partition('=')
     parts = rest.split(',')
     try:
@@ -98,7 +102,7 @@ def _motor(text: str) -> tuple[str, MotorNumber]:
 
 
 def _frame(text: str) -> tuple[str, str]:
-    """Argument type: a sensor and its frame."""
+    """Argument type: a sensor and its frame, SENSOR=FRAME; ArgumentTypeError for another form."""
     sensor, _, frame = text.partition('=')
     if not (sensor and frame):
         raise argparse.ArgumentTypeError(f'{text!r} is not SENSOR=FRAME, such as mocap=bar_link')
@@ -106,9 +110,10 @@ def _frame(text: str) -> tuple[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a correction in a form, and print its difference to the whole correction.
+    """Write a correction in a form, and print its difference to the whole correction; return 0.
 
-    Raises InputError for options that the form does not have, and unknown joints.
+    Raises InputError for options that the form does not have, unknown joints, an invalid file, and
+    a folder that is not new.
     """
     for given, forms, option in (
         (args.base, ('ur', 'ros2_control', 'rising'), '--base'),
@@ -154,7 +159,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
-    """Write the registrations for tf, with a launch file that publishes them."""
+    """Write the registrations for tf, with a launch file that publishes them; return 0.
+
+    Raises InputError for an unknown sensor of --frame.
+    """
     transforms = static_transforms(compensation, dict(args.frame))
     files = transform_files(transforms)
     _write(args.out, files)
@@ -176,7 +184,10 @@ def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
 
 
 def _write(folder: Path, files: Mapping[str, str]) -> None:
-    """Write files into a new folder."""
+    """Write files, name -> text, into a new folder; InputError if it is not new.
+
+    The folder is removed again if that fails.
+    """
     with undone_on_failure():
         make_new_folder(folder)
         for name, text in files.items():

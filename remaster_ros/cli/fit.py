@@ -55,7 +55,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, write the results, and print a short summary."""
+    """Fit, write the results, and print a short summary; return 0.
+
+    Raises InputError: a session, the priors or the folder cannot be used; InsufficientDataError:
+    the data do not allow a fit. What is implausible is logged as a warning.
+    """
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session

@@ -254,7 +254,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
-    """Argument type: a joint, and another one that is added to it or subtracted."""
+    """Argument type: a joint, and another one that is added to it (1) or subtracted (-1).
+
+    JOINT=JOINT or JOINT=-JOINT; ArgumentTypeError for another form.
+    """
     name, sign, other = text.partition('=')
     if not (name and sign and other.lstrip('+-')):
         raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=JOINT, such as J3=J2')
@@ -262,7 +265,10 @@ def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
 
 
 def _stretch(text: str) -> Stretch:
-    """Argument type: what was moved, and between which observations."""
+    """Argument type: what was moved, and between which observations, WHAT[@FROM-TO].
+
+    Either end may be missing: None. ArgumentTypeError for another form.
+    """
     what, at, between = text.partition('@')
     since, dash, until = between.partition('-')
     if at and not (dash and all(end.isdigit() or not end for end in (since, until))):
@@ -273,7 +279,10 @@ def _stretch(text: str) -> Stretch:
 
 
 def _turn(text: str) -> tuple[str, float]:
-    """Argument type: an axis and an angle in degrees."""
+    """Argument type: an axis x, y or z, and an angle of up to 360 degrees, AXIS=DEGREES.
+
+    ArgumentTypeError for another form.
+    """
     axis, sign, angle = text.partition('=')
     if axis not in ('x', 'y', 'z') or not sign:
         raise argparse.ArgumentTypeError(f'{text!r} is not AXIS=DEGREES, such as z=90')
@@ -281,7 +290,7 @@ def _turn(text: str) -> tuple[str, float]:
 
 
 def _pulses(text: str) -> tuple[float, ...]:
-    """Argument type: pulses per degree of each joint."""
+    """Argument type: pulses per degree of each joint, with commas; ArgumentTypeError for a 0."""
     counts = tuple(number(-1e9, 1e9)(part) for part in text.split(','))
     if not all(counts):
         raise argparse.ArgumentTypeError(f'{text!r}: no joint has 0 pulses a degree')
@@ -289,7 +298,10 @@ def _pulses(text: str) -> tuple[float, ...]:
 
 
 def _offset(text: str) -> tuple[str, float]:
-    """Argument type: a joint and an angle in degrees."""
+    """Argument type: a joint and an angle of up to 360 degrees, JOINT=DEGREES.
+
+    ArgumentTypeError for another form.
+    """
     name, sign, angle = text.rpartition('=')
     if not sign or not name:
         raise argparse.ArgumentTypeError(f'{text!r} is not JOINT=DEGREES, such as A2=-90')
@@ -297,10 +309,11 @@ def _offset(text: str) -> tuple[str, float]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the files, show what was read, test it with the robot, and write a session.
+    """Read the files, show what was read, test it with the robot, and write a session; return 0.
 
-    Raises InputError if files or options are invalid, InsufficientDataError if the data do not
-    fit the robot (unless --unchecked).
+    A session folder is mended (`_mend`), a bag with --moving read by `_import_moving`. Raises
+    InputError if files or options are invalid, InsufficientDataError if the data do not fit the
+    robot (unless --unchecked); nothing is written then.
     """
     if args.moving and (len(args.files) > 1 or not is_bag(args.files[0])):
         own = args.files[-1] / 'bag'
@@ -376,7 +389,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mend(args: argparse.Namespace) -> int:
-    """Write a session with its mistake corrected; raise InputError if it still does not fit."""
+    """Write a session with its mistake corrected, as the options say; return 0.
+
+    Raises InputError for options that do not go with a session or a joint that slides,
+    InsufficientDataError if it still does not fit (unless --unchecked).
+    """
     folder: Path = args.files[0]
     points = [name.lower() for name in args.points]
     if args.points and points not in ([*'xyz'], [*'yxz'], ['y_m', 'x_m', 'z_m']):
@@ -496,7 +513,10 @@ def _written(out: Path) -> str:
 
 
 def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
-    """Return the rows of the files; raise InputError for a bag among several files."""
+    """Return the rows of the files, tables or one bag.
+
+    Raises InputError for a bag among several files, and if a file cannot be read.
+    """
     bags = [path for path in args.files if is_bag(path)]
     if bags:
         if len(args.files) > 1:
@@ -530,7 +550,7 @@ def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
 
 
 def _session_options(args: argparse.Namespace, cell: Workcell | None) -> SessionOptions:
-    """Return the options of the session."""
+    """Return the options of the session; what is not given comes from the cell, if any."""
     sensor, marker, place, std = args.sensor, args.marker, args.marker_mm, args.marker_std_mm
     if cell is not None:
         sensor = sensor or cell.aim_at
@@ -554,7 +574,7 @@ def _session_options(args: argparse.Namespace, cell: Workcell | None) -> Session
 
 
 def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
-    """Yield a warning for each name option that the table overrides."""
+    """Yield a warning for each of --sensor and --marker that the table's own names override."""
     for what, given in (('sensor', args.sensor), ('marker', args.marker)):
         named = sorted(set(rows.labels.get(what, ())))
         if given and named and given not in named:

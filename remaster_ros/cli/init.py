@@ -101,9 +101,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Propose a cell for the robot, write the cell file, and plan in it.
+    """Propose a cell for the robot, write the cell file, and plan in it; return 0.
 
-    Raises InputError for an invalid robot, InsufficientDataError if too few poses are usable.
+    Raises InputError for an invalid robot, an unknown sensor or a file that is there already;
+    InsufficientDataError if fewer than `FEWEST_FITTED` poses are usable: then the file remains.
     """
     for sensor in args.sensors:
         if sensor not in SENSORS:
@@ -231,7 +232,10 @@ def _propose(
 
 
 def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str], list[str]]:
-    """Return the folders of the collision meshes, and the meshes that were not found."""
+    """Return the folders of the collision meshes, and the names of those that were not found.
+
+    ``text``: URDF; ``robot``: its path, from which relative names count.
+    """
     folders: dict[str, None] = {}
     missing = []
     for name in mesh_names(text):
@@ -261,7 +265,10 @@ def _cell(proposal: CellProposal, out: Path) -> Workcell:
 def _narrowed(
     p: CellProposal, cell: Workcell, rng: np.random.Generator
 ) -> tuple[CellProposal, Plan]:
-    """Return the proposal with ranges around the usable poses, and these poses."""
+    """Return the proposal with ranges around the usable poses, and these poses.
+
+    The ranges stay as they are with fewer than `FEWEST` of `TRIED` poses; `kept` says so.
+    """
     scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
     plan = scene.plan(TRIED, scene.rough_R, rng)
     lost = ', '.join(f'{count} {why}' for why, count in plan.dropped.items())
@@ -284,7 +291,8 @@ def _plan(
 ) -> tuple[dict[str, Any], str, tuple[int, int]]:
     """Return a plan in the new cell as JSON and as text, and counts of poses with a free path.
 
-    Planned as by the nodes, with only as many paths as show whether there are any.
+    Planned as by the nodes, with only as many paths as show whether there are any. If no pose is
+    left to fit, the plan is None with the reason, and the counts are 0.
     """
     chain = cell.chain()
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
@@ -304,7 +312,7 @@ def _plan(
 
 
 def _as_text(p: CellProposal) -> str:
-    """Return the proposal as text."""
+    """Return the proposal as text: arm, held joint, kinematics, ranges, missing meshes."""
     chain, held = p.chain, p.held
     lines = [
         f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'

@@ -47,7 +47,10 @@ TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 
 
 def build_parser(chosen: str | None) -> argparse.ArgumentParser:
-    """Return the parser with all verbs, and the options of the chosen one."""
+    """Return the parser with all verbs, and the options of the chosen one.
+
+    ``chosen``: verb, whose module is imported; None, or an unknown word, for none.
+    """
     parser = Parser(
         prog='remaster',
         description='Remaster a robot arm in place: joint zero-offsets with honest uncertainty.',
@@ -103,7 +106,12 @@ def _keep_freed_memory() -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit status."""
+    """Run the command line and return its exit status.
+
+    ``argv``: without the program's name, None for that of the process. 0 done; 1 the data allow no
+    answer; 2 wrong usage or bad input, or a fault; 130 after Ctrl-C, 141 if the reader of the
+    output has gone. Errors are one line on stderr; wrong options raise SystemExit.
+    """
     argv = sys.argv[1:] if argv is None else list(argv)
     # Products of small matrices in several threads take many times as long as in one: the threads
     # wait for each other at full speed. NumPy looks at this when it is first imported.
@@ -169,7 +177,7 @@ def _complete() -> None:
 
 
 def _complain(message: str) -> None:
-    """Print an error message."""
+    """Print an error message as one line on stderr."""
     print(f'error: {" ".join(message.split())}', file=sys.stderr)
 
 

@@ -28,19 +28,25 @@ class Parser(argparse.ArgumentParser):
 
 
 def integer(low: int) -> Callable[[str], int]:
-    """Return an argument type: an integer of at least `low`."""
+    """Return an argument type: an integer of at least `low`; ArgumentTypeError for others."""
     return _bounded(int, 'a whole number', low)
 
 
 def number(low: float = 0.0, high: float = math.inf, unit: str = '') -> Callable[[str], float]:
-    """Return an argument type: a finite number from `low` to `high`."""
+    """Return an argument type: a finite number from `low` to `high`, both included.
+
+    ``unit``: for messages. It raises ArgumentTypeError for others.
+    """
     return _bounded(float, 'a number', low, high, unit)
 
 
 def _bounded(
     kind: type[Number], what: str, low: float, high: float = math.inf, unit: str = ''
 ) -> Callable[[str], Number]:
-    """Return an argument type: a finite number of type `kind` from `low` to `high`."""
+    """Return an argument type: a finite number of type `kind` from `low` to `high`.
+
+    ``what``: the kind in words. It raises ArgumentTypeError, which names the limit, for others.
+    """
     unit = f' {unit}' if unit else ''
 
     def convert(text: str) -> Number:
@@ -72,7 +78,10 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
 
 
 def xacro_arguments(given: Iterable[object]) -> dict[str, str]:
-    """Return arguments given as NAME:=VALUE; raise InputError for another form."""
+    """Return arguments given as NAME:=VALUE, name -> value; the last of a name counts.
+
+    Raises InputError for another form.
+    """
     found = {}
     for text in map(str, given):
         name, sign, value = text.partition(':=')
@@ -100,7 +109,10 @@ def add_description(parser: argparse.ArgumentParser) -> None:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Argument type: distinct names separated by commas."""
+    """Argument type: distinct names separated by commas, in order.
+
+    Raises ArgumentTypeError for an empty name, or one that is there twice.
+    """
     found = tuple(part.strip() for part in text.split(','))
     if not all(found):
         raise argparse.ArgumentTypeError(f'{text!r} is no list of names with commas between')

@@ -97,7 +97,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Plan, and print the plan."""
+    """Plan, and print the plan; with --out and --check write page and table. Return 0.
+
+    Raises InputError: an invalid file or option; InsufficientDataError: too few poses can be
+    reached.
+    """
     if args.out is not None:
         check_plan_page(args.out)
     cell = read_cell(args.cell)
@@ -123,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> TravelTime:
-    """Return the travel times of the arm."""
+    """Return the travel times of the arm, by the options for speeds, settling and dwell."""
     return TravelTime.of(
         scene.model,
         args.speed_share,
@@ -178,7 +182,11 @@ def planned(
     args: argparse.Namespace,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Return the collection as the nodes plan it, with sensors at their rough positions."""
+    """Return the collection as the nodes plan it, with sensors at their rough positions.
+
+    ``progress``: called with the share done, 0 to 1. Raises as `plan_collection` and
+    `read_causes`.
+    """
     travel = _travel(cell, scene, args)
     causes = read_causes(args.separate, scene.model.chain.joint_names) if args.separate else ()
     counts = {

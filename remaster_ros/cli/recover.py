@@ -24,7 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Recover the session; return the exit status."""
+    """Recover the session; return the exit status, `LOST` with losses, else 0.
+
+    Raises InputError for no session, one that is being written, or a damaged one.
+    """
     recovery = recover_session(args.session)
     for line in () if args.json else recovery.lost:
         print(f'lost: {line}')

@@ -46,7 +46,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read or fit, write the page, print a short answer."""
+    """Read or fit, write the page, print a short answer; return 0.
+
+    Without a fit the session is fitted into `FIT_FOLDER` of the output. Raises InputError: a file
+    or the folder cannot be used; InsufficientDataError: the data do not allow a fit.
+    """
     fit_path, found_path = parts(args.results)
     session = read_to_fit(args.session)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
@@ -80,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_dict(answer: Answer, out: Path, plan: PlanFacts | None) -> dict[str, Any]:
-    """Return the JSON output."""
+    """Return the JSON output: path of the report, answer, and plan (None without one)."""
     return {
         'report': str(out / REPORT_FILE),
         'mood': answer.mood,

@@ -20,7 +20,9 @@ log = logging.getLogger('remaster_ros')
 def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
     """Read one session or several of one arm; return it, and lines on renamed rows.
 
-    Raises InputError if a session cannot be read, or zero-offsets show that arms differ.
+    The lines are [] for one session. Disagreements between sessions are logged as warnings, and
+    kept in the session. Raises InputError if a session cannot be read, or zero-offsets show that
+    arms differ; MistakeFoundError as `read_to_fit`.
     """
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
@@ -33,7 +35,10 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
 
 
 def _one_arm(session: Session, folder: Path) -> Session:
-    """Raise InputError if a correction was on for some rows and off for others."""
+    """Return the session; InputError if a correction was on for some rows and off for others.
+
+    Only a correction in the controller counts, by which reported angles mean two things.
+    """
     on = session.is_corrected
     correction = session.correction
     if correction is not None and correction.is_inside and on.any() and not on.all():
@@ -46,7 +51,10 @@ def _one_arm(session: Session, folder: Path) -> Session:
 
 
 def refuse_moving(session: Session, folder: Path, verb: str) -> None:
-    """Raise InputError if the arm moved while a session was measured."""
+    """Raise InputError if the arm moved while a session was measured.
+
+    ``folder, verb``: for the message.
+    """
     if session.is_moving:
         raise InputError(
             f'{folder}: was measured while the arm moved, which "remaster {verb}" does not take; '

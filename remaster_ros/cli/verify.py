@@ -63,7 +63,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate a session, and print the verdict."""
+    """Evaluate a session, and print the verdict; return 0, whatever it is.
+
+    Raises InputError: a file is invalid, of another arm, or lacks what was wanted or the state of
+    the correction. Warnings are logged.
+    """
     session, compensation = read_session(args.session), read_compensation(args.compensation)
     refuse_moving(session, args.session, 'verify')
     require_same_arm(session, compensation, args.session)
@@ -76,7 +80,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def visits(session: Session, folder: Path) -> Visits:
-    """Return the rows with desired joint angles; `folder`: for messages."""
+    """Return all rows of a session as visits; ``folder``: for messages.
+
+    Raises InputError if a row does not tell whether the correction was on, or what was wanted.
+    """
     m = session.measurements
     on = _on(session, folder)
     wanted = _wanted(session, folder, on)
@@ -91,7 +98,10 @@ def visits(session: Session, folder: Path) -> Visits:
 
 
 def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) -> IntArray:
-    """Return configuration numbers, (n,), with repeated visits numbered as the first one."""
+    """Return configuration numbers, (n,), with repeated visits numbered as the first one.
+
+    Repeated is a visit with the same wanted joints, as `nearest_solution` judges.
+    """
     numbers, firsts = configuration.copy(), dict[int, FloatArray]()
     for each in dict.fromkeys(configuration.tolist()):
         mine = configuration == each
@@ -179,7 +189,10 @@ def _named(names: Any) -> str:
 
 
 def _warnings(session: Session, compensation: Compensation) -> list[str]:
-    """Return warnings on the session."""
+    """Return warnings on the session, a line each: another file, accuracy option, nothing wanted.
+
+    Also a correction that was measured on top of another one; [] if there are none.
+    """
     state = compensation.content.state
     stated, before = session.correction, state.get('correction')
     found = []
@@ -225,7 +238,7 @@ def _content(found: VerificationResult, warnings: list[str]) -> dict[str, Any]:
 
 
 def _in_words(found: VerificationResult) -> str:
-    """Return the verdict as a sentence."""
+    """Return the verdict as a sentence, with the number of poses that would do if unclear."""
     words = WORDS[found.verdict]
     if found.verdict != 'unclear':
         return words
@@ -253,5 +266,5 @@ def _text(found: VerificationResult) -> str:
 
 
 def _share(one: Estimate) -> str:
-    """Return a share with its interval as text."""
+    """Return a share with its standard deviation and verdict: '+1.000 ± 0.050 (in_use)'."""
     return f'{one.share:+.3f} ± {one.std:.3f} ({one.verdict})'
