@@ -112,7 +112,7 @@ class Found(Discovery):
         return as_figures(discovery_figures(self), self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write what ``remaster discover --out`` writes; else as `Fit.save`."""
+        """Write what ``remaster discover --out`` writes; return the report as `Fit.save`."""
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
         from remaster_ros.reports.result_folder import prepare_folder, save_discovery
 

@@ -250,7 +250,7 @@ class Measurements:
         )
 
     def select(self, rows: BoolArray | IntArray) -> Measurements:
-        """Return the given rows (a mask or indices), in that order."""
+        """Return the given rows (a mask or indices), in that order, as new arrays."""
         columns: dict[str, Any] = {
             name: None if value is None else value[rows] for name, value in vars(self).items()
         }

@@ -237,7 +237,11 @@ def worked(job: Job) -> dict[str, Any]:
 
 
 def _results(job: Job) -> dict[str, Any]:
-    """Return the row of a session; raise the errors of reading and fitting it."""
+    """Return the row of a session; results are written into `job.out`.
+
+    An InsufficientDataError of the search, or an error of the check, becomes the text of its
+    column; errors of reading and fitting are raised.
+    """
     import numpy as np
 
     from remaster_ros.calibration.fit import fit_session

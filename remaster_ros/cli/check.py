@@ -136,7 +136,10 @@ def measured_of(session: Session) -> Measured:
 
 
 def _seconds(created: str) -> float:
-    """Return the Unix time of an ISO 8601 one, UTC where it states no zone; NaN of ''."""
+    """Return the Unix time, s, of an ISO 8601 text, UTC if it states no zone; NaN of ''.
+
+    Raises ValueError for another text.
+    """
     if not created:
         return float('nan')
     moment = datetime.fromisoformat(created)

@@ -60,7 +60,10 @@ def _duration(seconds: float) -> str:
 
 
 def tell(args: argparse.Namespace, content: Mapping[str, Any], *lines: str) -> None:
-    """Print one JSON object with --json; else the non-empty lines, unless --quiet."""
+    """Print one JSON object with --json; else the non-empty lines, unless --quiet.
+
+    With --json also if it is quiet.
+    """
     if args.json:
         print(json.dumps(content))
     else:

@@ -582,7 +582,10 @@ def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
 
 
 def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
-    """Return a summary of the tables and of their interpretation, as text."""
+    """Return a summary of the tables and of their interpretation, as text.
+
+    ``how``: lines that are added at the end.
+    """
     width = max(map(len, rows.columns))
     lines = [*rows.description]
     lines += [f'  {column:{width}s}  {meaning}' for column, meaning in rows.columns.items()]

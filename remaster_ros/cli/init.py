@@ -178,7 +178,10 @@ def _urdf_file(robot: Path, out: Path, text: str) -> Path:
 def _propose(
     args: argparse.Namespace, text: str, urdf: Path, rng: np.random.Generator
 ) -> CellProposal:
-    """Return the proposed cell; raise InputError if poses cannot be planned for the robot."""
+    """Return the proposed cell; InputError if poses cannot be planned for the robot.
+
+    ``text``: URDF; ``urdf``: path that the cell will name.
+    """
     try:
         model = parse_urdf(text)
         base = likely_base(model) if args.base_link is None else args.base_link
@@ -338,7 +341,7 @@ def _as_text(p: CellProposal) -> str:
 
 
 def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
-    """Return the proposal for --json."""
+    """Return the proposal for --json, as plain data."""
     held = p.held
     return {
         'cell': str(out),
@@ -355,7 +358,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
 
 
 def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
-    """Return the inverse kinematics for --json."""
+    """Return how joint solutions are found, for --json; None without a closed form near."""
     off = kinematics.difference
     return {
         'way': kinematics.method,

@@ -118,7 +118,11 @@ def _chain(session: Session) -> SerialChain:
 
 
 def _on(session: Session, folder: Path) -> BoolArray:
-    """Return whether the correction was on at each row, (n,); raise InputError if unknown."""
+    """Return whether the correction was on at each row, (n,).
+
+    Unknown rows are on if the session states a correction; else InputError, with the first of
+    them.
+    """
     m = session.measurements
     state = np.full(len(m), -1) if m.correction is None else m.correction
     if session.correction is not None:
@@ -157,7 +161,11 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
 
 
 def require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
-    """Raise InputError for a session of another arm, and for the one of the correction."""
+    """Raise InputError for a session of another arm, and for the one of the correction.
+
+    Joints, base and tip link have to be the same by name, markers among the correction's.
+    ``folder``: for messages.
+    """
     chain, robot = _chain(session), compensation.content.robot
     for quantity, session_value, correction_value in (
         ('joints', list(chain.joint_names), robot.joint_names),

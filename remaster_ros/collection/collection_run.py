@@ -127,7 +127,10 @@ class CollectionRun:
         self.state, self.why = 'running', ''
 
     def pause(self) -> bool:
-        """Pause the run, also one that would be resumed; return whether it is paused."""
+        """Pause the run, also one that would be resumed; return whether it is paused.
+
+        True too if it was paused before; another state is not changed.
+        """
         if self.left or self.state == 'running':
             self.left = ''
             self.end('paused')

@@ -23,7 +23,7 @@ def stamp_key(stamp: Any) -> str:
 
 
 def temperature_topic(marker_topic: str) -> str:
-    """Topic of a sensor's thermometer, next to that of its marker."""
+    """Topic of a sensor's thermometer, next to that of its marker: a/marker -> a/temperature."""
     place, slash, _ = marker_topic.rpartition('/')
     return f'{place}{slash}temperature'
 
@@ -102,7 +102,10 @@ prefix is in the names, so that a bridge that ignores it finds none of its joint
 
 
 def correction_asked(message: Any) -> str:
-    """Correction that joint solutions require: ``on``, ``off``, or '' for any."""
+    """Correction that joint solutions require: ``on``, ``off``, or '' for any.
+
+    By the prefixes `CORRECTED`, if all joint names have the same one.
+    """
     for state, prefix in CORRECTED.items():
         if message.joint_names and all(name.startswith(prefix) for name in message.joint_names):
             return state

@@ -289,7 +289,11 @@ class Pairing:
     def _add_silence(
         self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
     ) -> None:
-        """Add to the time, not excused yet, without messages of each sensor's node."""
+        """Add to the time, not excused yet, without messages of each sensor's node.
+
+        It begins anew with a message, for an absent sensor, and for one without a count.
+        ``passed_s``: s since the last call.
+        """
         for name in self.rules:
             same = name in counts and counts[name] == self._message_counts.get(name)
             silent = same and name not in absent
@@ -346,7 +350,10 @@ class Pairing:
         return np.inf if self._patient else rules.allowed_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
-        """Rejection of a sensor after `allowed` s: too few samples, or none that can be used."""
+        """Rejection of a sensor after `allowed` s: too few samples, or none that can be used.
+
+        ``too_few`` for a stream with some, but fewer than `min_samples`; else ``stale``.
+        """
         count = max(len(_seen(part)) for part in self._by_marker(rules).values())
         if 0 < count < rules.min_samples and not rules.single_shot:
             detail = f'{count} usable samples in {allowed:.1f} s (at least {rules.min_samples})'
@@ -366,7 +373,11 @@ class Pairing:
     def _settle(
         self, rules: SensorRules, end: float, used: Mapping[str, list[MarkerReading]]
     ) -> None:
-        """Decide on a sensor by the readings of its markers up to the end of the measurement."""
+        """Decide on a sensor by the readings of its markers up to the end of the measurement.
+
+        ``end``: s; ``used``: of `_used`. Its first accepted marker decides; others go to `further`
+        and `left_out`. If none is accepted, the first rejection decides.
+        """
         judged = [self._judge(rules, end, marker, part) for marker, part in used.items()]
         accepted = [item for item in judged if isinstance(item, PairedReading)]
         if not accepted:
@@ -488,7 +499,7 @@ class Pairing:
         return PairedReading(rules.sensor, marker, end, q_mean, mean, std, count, turn, dropped)
 
     def _moved_text(self, moved: FloatArray) -> str:
-        """Text with the largest of the joint movements (k,) and the allowed one."""
+        """Text with the largest of the joint movements (k,) and the allowed one, rad or mm."""
         joint, allowed = self._units.farthest(moved), self.motion_tolerance
         if self._units.slide(joint):
             allowed *= self._units.per_radian[joint]

@@ -94,7 +94,10 @@ class EndedReading:
         return '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in self.rejected)
 
     def event(self, *, registered: bool) -> ConfigurationEnded:
-        """Event that informs the other nodes."""
+        """Event that informs the other nodes of the outcome.
+
+        ``registered``: whether every sensor that the arm waits for is registered.
+        """
         return ConfigurationEnded(
             stamp=self.settled.pose.stamp,
             solution=self.settled.solution,
@@ -238,7 +241,11 @@ class Recording:
         return self.pairing is None and not self._due
 
     def _queue(self, q: FloatArray, stamp_s: float, change: FloatArray | None) -> bool:
-        """Queue a configuration; False if the pose has no such solution."""
+        """Queue a configuration to be read; False, and nothing, if the pose has no such solution.
+
+        False also if no pose is known. ``change``: by a correction, subtracted from q, rad or m,
+        (k,).
+        """
         pose = self.pose
         if pose is None or self._solutions is None:
             return False
@@ -252,7 +259,10 @@ class Recording:
     # The readings, one after the other
 
     def look_again(self) -> None:
-        """Queue an unknown configuration once its pose is known, if the arm still stands there."""
+        """Queue an unknown configuration once its pose is known, if the arm still stands there.
+
+        It stands if no joint has moved by more than the tolerance since; else it is forgotten.
+        """
         if self._unknown is None or self.pose is None:
             return
         q, settled_s, change = self._unknown

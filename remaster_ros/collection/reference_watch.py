@@ -108,7 +108,7 @@ class SetupChange:
     look_alikes: tuple[str, ...] = ()  # Other subjects that explain the same readings
 
     def describe(self) -> str:
-        """Sentence on the change."""
+        """Sentence on the change: what, when (by configurations), size in mm, look-alikes."""
         turn = ''
         if self.turn_rad is not None:
             turn = f' and turned by {np.rad2deg(self.turn_rad) * 60:.1f} arc minutes'
@@ -214,7 +214,10 @@ class ReferenceWatch:
         return not self._open or self._key(reading) in self._rounds[-1].rows
 
     def _key(self, reading: ReferenceReading) -> tuple[int, str]:
-        """Number of a reading's reference (a new one if none is near), and its sensor."""
+        """Number of a reading's reference (a new one if none is near), and its sensor.
+
+        From 0 in the order of the first visits; near as in `nearest_solution`.
+        """
         known = None
         if self._references:
             units = JointUnits.of(self._chain)
@@ -226,7 +229,10 @@ class ReferenceWatch:
         self._open = False
 
     def accept(self) -> None:
-        """Use the next round as the new normal state: a person has checked the change."""
+        """Use the next round as the new normal state: a person has checked the change.
+
+        `change` is None then; after ``unsteady`` all rounds before are forgotten.
+        """
         if self.change is not None and self.change.kind == 'unsteady':
             # Repeatability is still to be found.
             self._rounds = []
@@ -459,7 +465,10 @@ class ReferenceWatch:
 
 
 def _centered(values: FloatArray, group: IntArray) -> FloatArray:
-    """Values (n, ...) less the mean of their group, (n,), as the first value is unknown."""
+    """Values (n, ...) less the mean of their group, as the first value is unknown.
+
+    ``group``: number of each value's group, (n,), from 0.
+    """
     count = np.bincount(group)
     total = np.zeros((len(count), *values.shape[1:]))
     np.add.at(total, group, values)

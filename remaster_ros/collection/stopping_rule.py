@@ -56,7 +56,10 @@ class StoppingGoal:
 
     @classmethod
     def of(cls, poses: PoseSettings) -> StoppingGoal:
-        """Goal of a cell file; an empty one if an optimal design's goal is not stated."""
+        """Goal of a cell file, in rad and m; an empty one if it states none.
+
+        Empty also if an optimal design has to reach a precision that is not stated.
+        """
         stated = (poses.joint_std_deg, poses.tool_std_m)
         matters = (poses.tool_share < 1.0, poses.tool_share > 0.0)
         if poses.design == OPTIMAL and None in compress(stated, matters):
@@ -187,7 +190,7 @@ class StoppingRule:
         return self.goal.stated and not look.lacking
 
     def describe(self, look: Look) -> str:
-        """Result of a look, and the cost of the goal, for people."""
+        """Result of a look in a sentence for people: structure, what is known, cost."""
         counted = f' ({1e3 * np.radians(LEVER_M):.2f} mm count as one)' * bool(look.sliding)
         known = (
             f'std of the offsets {np.degrees(look.joint_rms):.4f} deg{counted}, error of the '
@@ -216,7 +219,10 @@ class StoppingRule:
         return f'about {look.more} more configurations to fit{time}{planned}'
 
     def _structure(self, found: Estimate, count: int) -> tuple[StructureTest, ...]:
-        """Significant tests of structure, by p-value; () if none is significant or due."""
+        """Significant tests of structure, by p-value; () if none is significant or due.
+
+        Significant is below `limit` divided by the number of tests.
+        """
         limit = self.limit(count)
         if limit == 0.0:
             return ()
@@ -227,7 +233,11 @@ class StoppingRule:
     def _lacking(
         self, found: Estimate, precision: Precision, structure: tuple[StructureTest, ...]
     ) -> str:
-        """Reason why the goal is not reached after a look; '' if reached or none is stated."""
+        """Reason why the goal is not reached after a look; '' if reached or none is stated.
+
+        In this order: joints, tool, degrees of freedom (`FREEDOM_PER_PARAMETER` times the
+        parameters), poses and repeats (`floors`), structure of the residuals.
+        """
         goal, needed = self.goal, FREEDOM_PER_PARAMETER * precision.parameters
         if not goal.stated:
             return ''

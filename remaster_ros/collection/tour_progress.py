@@ -95,7 +95,7 @@ class TourProgress:
         self.inspection: Callable[[], Tour] | None = None
 
     def describe(self) -> str:
-        """Return the progress as text."""
+        """Return as text how many poses are begun and configurations done."""
         tour = self._memory.tour
         poses = f'{tour.poses_begun} of {sum(tour.poses.values())}' if tour else 'none'
         done = sum(self.decided.outcomes.values())

@@ -209,7 +209,11 @@ class Demo:
         return results
 
     def _apply(self) -> Path:
-        """Collect again with the bridge's correction; return the file of the correction."""
+        """Collect again with the bridge's correction; return the file of the correction.
+
+        That of the discovery if causes were looked for and it wrote one, else that of the fit.
+        Raises DeviceError as `_wait`.
+        """
         file = self.discovery / APPLY_FOLDER / COMPENSATION_FILE
         if not (self.requests and file.exists()):
             file = self.fit / APPLY_FOLDER / COMPENSATION_FILE
@@ -309,7 +313,10 @@ class Demo:
             self.processes.start(name, config_path('fake.yaml'), overrides[name])
 
     def _spin(self) -> None:
-        """Handle messages and restarts; raise KeyboardInterrupt after a signal."""
+        """Handle messages for 0.1 s at most, and restarts of killed nodes.
+
+        Raises KeyboardInterrupt after a signal, DeviceError as `NodeProcesses.check`.
+        """
         self._executor.spin_once(timeout_sec=0.1)
         if self._stopping:
             raise KeyboardInterrupt
@@ -340,7 +347,10 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        """Whether all nodes are up, the robot reports and both sensors measure."""
+        """Whether all nodes are up, the robot reports and both sensors measure.
+
+        By their last summaries.
+        """
         summaries = self.node.summaries
         return (
             summaries.keys() >= {*CORE, *SENSORS}

@@ -44,7 +44,7 @@ class NodeProcesses:
         self._short_lives: Counter[str] = Counter()
 
     def start(self, name: str, parameters_file: Path, parameters: Mapping[str, Any]) -> None:
-        """Start the node `name`; ``parameters`` override those of the file."""
+        """Start the node `name`; ``parameters`` override those of the file. Returns at once."""
         command = [sys.executable, '-m', 'remaster_ros.nodes', name, '--ros-args']
         command += ['--params-file', str(parameters_file)]
         for key, value in parameters.items():
@@ -94,7 +94,10 @@ class NodeProcesses:
         return self._running[name].pid
 
     def stop(self, names: Sequence[str] = (), grace_s: float = 20.0) -> list[str]:
-        """End processes, all by default; return the names of those killed after `grace_s`."""
+        """End processes, all by default; return the names of those killed after `grace_s`.
+
+        By SIGINT, then SIGKILL. Raises KeyError for a name that is not running.
+        """
         ended = {name: self._running[name] for name in names or self._running}
         for process in ended.values():
             if process.poll() is None:

@@ -81,7 +81,10 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
 
 
 def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
-    """Print the found causes beside the hidden ones, and the gain."""
+    """Print the found causes beside the hidden ones, with parameters, and the gain.
+
+    Found causes that are not hidden are listed as such.
+    """
     found: dict[Any, list[FoundEffect]] = {}
     for claim in discovery.effects:
         for cause in named_cause(msgspec.to_builtins(claim)):

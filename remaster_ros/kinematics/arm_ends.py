@@ -166,7 +166,7 @@ def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[
 
 
 def _turning_before(model: UrdfModel, link: str) -> int:
-    """Return the number of revolute joints between the root and a link."""
+    """Return the number of the arm's revolute joints (`_turns`) between the root and a link."""
     count = 0
     while (joint := model.parent_joint.get(link)) is not None:
         count += _turns(joint)
@@ -175,7 +175,7 @@ def _turning_before(model: UrdfModel, link: str) -> int:
 
 
 def _turning_behind(model: UrdfModel, link: str) -> int:
-    """Return the largest number of revolute joints in one chain behind a link."""
+    """Return the largest number of the arm's revolute joints in one chain behind a link."""
     return max(
         (
             _turns(joint) + _turning_behind(model, joint.child)

@@ -120,7 +120,11 @@ class BodyPairs:
     def _set_pairs(
         self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
     ) -> None:
-        """Set the pairs and the constants of each of them."""
+        """Set the pairs and the constants of each of them: levers, clearances, kinds.
+
+        ``inner, outer``: indices of the bodies, -1 for the floor, (P,); ``contact_only``: None for
+        none.
+        """
         self.inner, self.outer = inner, outer
         self.is_floor = inner < 0
         shapes = [body.shape for body in self.bodies]
@@ -153,7 +157,11 @@ class BodyPairs:
         )
 
     def _apply_rule(self) -> None:
-        """Remove pairs that overlap by construction; see the module `collision`."""
+        """Remove pairs that overlap by construction; check near ones for contact only.
+
+        Over `_SAMPLES` random configurations: in `_MOST` of them for two bodies of the arm, in all
+        for floor and obstacles. Each such pair gets a line in `left_out`.
+        """
         low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
         q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)

@@ -429,7 +429,10 @@ def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
 
 
 def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
-    """Raise InputError if the number of free joints or a held value is not supported."""
+    """Raise InputError if the number of free joints or a held value is not supported.
+
+    Free are six, or all of three to five joints; values have to be within the limits.
+    """
     free = len(chain) - len(held)
     if free != min(len(chain), FREE_JOINTS) or free < FEWEST_JOINTS:
         raise InputError(

@@ -70,7 +70,7 @@ class UrdfModel:
 
     @cached_property
     def child_joints(self) -> Mapping[str, list[UrdfJoint]]:
-        """Joints that each link carries, in file order, by link name."""
+        """Joints that each link carries, in file order, by link name; [] for a leaf."""
         found: dict[str, list[UrdfJoint]] = {name: [] for name in self.links}
         for joint in self.parent_joint.values():
             found[joint.parent].append(joint)
@@ -168,7 +168,7 @@ def parse_urdf(text: str) -> UrdfModel:
 
 
 def _refuse_deep(model: UrdfModel) -> None:
-    """Raise InputError if links form a longer chain than any arm has."""
+    """Raise InputError if there are more than `MOST_DEPTH` links in one chain."""
     level, depth = [model.root], 0
     while level := [joint.child for link in level for joint in model.child_joints[link]]:
         depth += 1

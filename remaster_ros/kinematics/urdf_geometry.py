@@ -89,7 +89,11 @@ def mesh_names(text: str) -> list[str]:
 
 
 def _shape(element: ElementTree.Element, where: str, read_mesh: MeshReader) -> Shape | None:
-    """Read a geometry element; None if `read_mesh` leaves its mesh out. Raises InputError."""
+    """Read a geometry element; None if `read_mesh` leaves its mesh out.
+
+    ``where``: for messages. Raises InputError for an unknown element, or sizes that are malformed
+    or not positive.
+    """
     if element.tag == 'box':
         return box(numbers(attribute(element, 'size', where), 3, f'the size of {where}'))
     if element.tag == 'sphere':

@@ -426,7 +426,10 @@ class ArmSupervisor:
 
     @property
     def trouble(self) -> str:
-        """Trouble with the joint reports (refused, silent, of other joints), or ''."""
+        """Trouble with the joint reports (refused, silent, of other joints), or ''.
+
+        Messages of other joints count while the arm's have been silent for `rules.heartbeat_s`.
+        """
         limit = self.rules.heartbeat_s
         silent = self._interlocks.silence_s('robot', self._wall) > limit
         others = silent and self._wall - self._others_wall <= limit
@@ -561,14 +564,20 @@ class ArmSupervisor:
         return self._step(BEGINS.get(solution, Event.MOVE), drive)
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
-        """Actions after a refused move: the next solution, or a halt if it is no solution's."""
+        """Actions after a refused move: the next solution, or a halt if it is no solution's.
+
+        ``solution``: its index; negative for a probe, a way out, or the check of where it stands.
+        """
         if solution < 0:
             return self._halt(reason)
         actions = self._refuse(solution, reason)
         return [*actions, *self.tick(wall_s)]
 
     def _refuse(self, solution: int, reason: str) -> list[Action]:
-        """Actions after a configuration was refused: a halt after `REFUSED_IN_A_ROW`."""
+        """Actions after a configuration was refused: `Failed`, and the next one is next.
+
+        A halt after `REFUSED_IN_A_ROW` of them, none reached between.
+        """
         self._queue.next = solution + 1
         self._refusals += 1
         failed = self._step(Event.REFUSED, Failed(solution, reason))
@@ -579,7 +588,10 @@ class ArmSupervisor:
     # Inside: what becomes of the motion under way
 
     def _conclude(self, outcome: str, why: str, seen: Seen) -> list[Action]:
-        """Actions after the outcome of a visit or a stop; ``why``: the outcome's reason."""
+        """Actions after the outcome of a visit or a stop; [] while it is under way.
+
+        ``outcome, why``: an `Outcome`. If settled, the counts of failures begin anew.
+        """
         visit = self._motion.visit
         if outcome == 'halted':
             return self._halt(why, Event.ASTRAY)
@@ -616,7 +628,10 @@ class ArmSupervisor:
         return self._step(event, Halted(self.halted))
 
     def _halt_braking(self, reason: str, wall_s: float) -> list[Action]:
-        """Actions that halt an arm; it is stopped first if it is known to follow its path."""
+        """Actions that halt an arm; it is stopped first if it is known to follow its path.
+
+        Known is an arm that is not `lost`; otherwise nothing is commanded.
+        """
         seen = self._seen
         if seen is not None and self.state in (Arm.LEAVES, Arm.MOVES):
             known = not self._motion.lost(seen, wall_s)

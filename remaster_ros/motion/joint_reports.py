@@ -78,7 +78,10 @@ class ClockRate:
         self.rate = 1.0
 
     def update(self, clock_s: float, wall_s: float) -> None:
-        """Process the node's clock and the wall's, read together, s."""
+        """Update the rate by the node's clock and the wall's, read together, s.
+
+        Over the last `RATE_WINDOW_S`, at least `RATE_LEAST_S`; a clock that goes back begins anew.
+        """
         seen = self._seen
         if seen and clock_s < seen[-1][1]:
             # Set back: nothing before it counts.
@@ -197,7 +200,11 @@ class JointReports:
         return self._doubt_time(report)
 
     def _doubt_time(self, report: JointReport) -> tuple[str, str]:
-        """Kind ('late', 'early') and text if a report's stamp is off its time; else '', ''."""
+        """Kind ('late', 'early') and text if a report's stamp is off its time; else '', ''.
+
+        Off is more than `LATE_S` and a wall time times the rate from the usual delay; '', ''
+        before that is known.
+        """
         if self._delay is None:
             return '', ''
         late = report.clock_s - report.stamp_s - self._delay

@@ -121,7 +121,10 @@ class Liveness:
         return why
 
     def _why(self, name: str, now_s: float) -> str:
-        """Why a sensor is absent (silent, not ready), or ''; '' if it was never seen."""
+        """Why a sensor is absent (silent, not ready, no reading since its start), or ''.
+
+        '' also if its node has never reported.
+        """
         if name not in self._seen:
             return ''
         if now_s - self._seen[name] > self._heartbeat_s:
@@ -131,7 +134,10 @@ class Liveness:
         return self._trouble[name]
 
     def _why_unsure(self, name: str, now_s: float) -> str:
-        """Why it is too early to judge a sensor (not yet reported, just restarted), or ''."""
+        """Why it is too early to judge a sensor (not yet reported, just restarted), or ''.
+
+        Within `UNSEEN_S` of the begin, or `BACK_S` of a restart; ``now_s``: s.
+        """
         unseen = name not in self._seen and name not in self._read
         if unseen and now_s - self._since_s < UNSEEN_S:
             return 'its node has not reported yet'

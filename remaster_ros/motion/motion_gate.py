@@ -540,7 +540,10 @@ class Cubic:
         return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
 
     def range(self) -> tuple[FloatArray, FloatArray]:
-        """Return the smallest and the largest position of each joint, (k,) or (n, k) each."""
+        """Return the smallest and the largest position of each joint, (k,) or (n, k) each.
+
+        Over the whole cubic, between its ends too; rad or m.
+        """
         _, velocity, second, third = self.coefficients
         # Where the velocity v + 2 c t + 3 d t^2 is zero, and at both ends.
         root = np.sqrt(np.maximum(second**2 - 3 * third * velocity, 0.0))

@@ -339,7 +339,10 @@ class MotionUnderWay:
         self._piece, self._piece_sent_s = piece, sent_s
 
     def end_piece(self, seen: Seen, wall_s: float, rate: float) -> None:
-        """Watch the present piece end in its stop, as no further one is sent."""
+        """Watch the present piece end in its stop, as no further one is sent.
+
+        Sets `braking`; there must be a visit and a piece. ``rate``: robot time per wall time.
+        """
         assert self.visit is not None
         assert self._piece is not None
         begins = self.visit.following.sent + self._piece.cut_s

@@ -63,7 +63,10 @@ class PointSpeeds:
         self.reach_m[chain.slides] = 1.0
 
     def fastest(self, q: FloatArray, velocity: FloatArray) -> FloatArray:
-        """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k)."""
+        """Return the speed of the fastest point, m/s, (n,), at q and joint velocities (n, k).
+
+        rad and rad/s, or m and m/s; 0 for an arm without points.
+        """
         # The turn and the velocity of its joint's point of each link, in its own frame with the
         # joint's axis as Z (Featherstone, "Rigid Body Dynamics Algorithms", 2008, eq. 5.14): a
         # fixed step is one product, a turn about Z mixes X and Y, and points stand still.

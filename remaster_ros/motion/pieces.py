@@ -106,7 +106,10 @@ def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
 
 
 def step_of(trajectory: Trajectory, index: int) -> Piece:
-    """Return the line of this number, from 0, as a piece. Raises IndexError if there is none."""
+    """Return the line of this number, from 0, as a piece, with times of the trajectory.
+
+    It is the last piece if it is the last line.
+    """
     line, start_s = trajectory.lines[index], trajectory.starts_s[index]
     points = tuple(replace(p, time_s=start_s + p.time_s) for p in line.waypoints())
     is_last = index + 1 == len(trajectory.lines)

@@ -80,7 +80,10 @@ class Then:
 
 
 def _always(state: Arm) -> dict[Event, Then]:
-    """Return the rows of most states: a halt halts, and a stop needs no command."""
+    """Return the rows of most states: a halt halts, and a stop needs no command.
+
+    ``state``: that of the rows, which a stop does not change.
+    """
     return {
         Event.STOP: Then(state),
         Event.HALT: Then(Arm.HALTED, (Halted,)),
@@ -89,7 +92,10 @@ def _always(state: Arm) -> dict[Event, Then]:
 
 
 def _commanded(state: Arm) -> dict[Event, Then]:
-    """Return the rows of the two states with a move under way, where a stop is commanded."""
+    """Return the rows of a state with a move under way, in which a stop is commanded.
+
+    ``state``: `Arm.LEAVES` or `Arm.MOVES`.
+    """
     return {
         **_always(state),
         Event.STOP: Then(Arm.BRAKES, (Stop,)),

@@ -107,13 +107,19 @@ class _Stretch:
         return 3 * gap - 2 * v, v - 2 * gap
 
     def _acceleration(self, time: float, end: float) -> float:
-        """Return the largest acceleration of a stop, as a share of its limit."""
+        """Return the largest acceleration of a stop, as a share of its limit.
+
+        Over all places and joints; ``time``: s; ``end``: share of the line.
+        """
         second, third = self._coefficients(time, end)
         largest = np.maximum(np.abs(2 * second), np.abs(2 * second + 6 * third))
         return float(np.max(largest)) / time**2 * self._hardness
 
     def _farthest(self, time: float, end: float) -> float:
-        """Return the largest share that any of the cubics reaches."""
+        """Return the largest share of the line that any of the cubics reaches.
+
+        ``time``: of the stop, s; ``end``: share at which it ends.
+        """
         second, third = self._coefficients(time, end)
         # Its speed is zero at the end, and at the share v T / (3 third). That is the farthest only
         # where it comes first, with a positive third; else the end is, or the start.

@@ -111,7 +111,7 @@ class Line:
         return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
 
     def time_s(self, share: float) -> float:
-        """Return when a share of the way is gone, s: the inverse of `share`; clipped to 0 … 1."""
+        """Return when a share of the way is gone, s: the inverse of `share`, clipped to 0 … 1."""
         share = min(max(share, 0.0), 1.0)
         ramp = 0.5 * RAMP_S * self.rate
         if share <= ramp:
@@ -147,7 +147,7 @@ class Trajectory:
 
     @cached_property
     def starts_s(self) -> tuple[float, ...]:
-        """When each line begins, s."""
+        """When each line begins, s from the trajectory's start, which is 0; rests included."""
         times = [0.0]
         for line in self.lines[:-1]:
             times.append(times[-1] + line.duration_s + self.rest_s)

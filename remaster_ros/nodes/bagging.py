@@ -193,7 +193,7 @@ def name_in_bag(topic: str) -> str:
 
 
 def _free(folder: Path) -> Path:
-    """Return the first of bag_1, bag_2, … that does not exist."""
+    """Return the first of the folders NAME_1, NAME_2, … beside `folder` that does not exist."""
     number = 1
     while (free := folder.with_name(f'{folder.name}_{number}')).exists():
         number += 1

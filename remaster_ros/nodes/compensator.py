@@ -328,7 +328,11 @@ class CompensatorNode(RemasterNode):
         return self._led.elsewhere(q)
 
     def _moves(self) -> str:
-        """Return that the arm moves, is about to, or is not reported; '' if it stands."""
+        """Return that the arm moves, is about to, or is not reported; '' if it stands.
+
+        It stands after `following.STANDING_S` without motion (`ArmReports.stands`), with no
+        trajectory under way.
+        """
         if not self._present.is_fresh(time.monotonic()):
             return f'{self.resolve_topic_name(JOINTS)} does not come'
         if not self._present.stands:
@@ -855,7 +859,7 @@ def _points(
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node; return its exit status, see `running.run`."""
     # What is worked out must not keep a cancelling waiting for the interpreter: 1 ms instead of 5.
     sys.setswitchinterval(1e-3)
     make: Callable[[], RemasterNode] = CompensatorNode

@@ -89,7 +89,7 @@ class ForeignGoals:
         )
 
     def _on_status(self, message: GoalStatusArray) -> None:
-        """Keep the identifiers of the goals that are under way at the controller."""
+        """Keep the identifiers of the goals that are under way at the controller (`UNDER_WAY`)."""
         self._active = {
             bytes(status.goal_info.goal_id.uuid)
             for status in message.status_list
@@ -295,7 +295,10 @@ class ActionLink:
         self._copies.publish(message)
 
     def cancel(self) -> None:
-        """Cancel all goals, so that the controller holds the arm; no command is to follow."""
+        """Cancel all goals, so that the controller holds the arm; no command is to follow.
+
+        Returns at once; a goal that is not accepted yet is cancelled once it is.
+        """
         for goal in self._goals:
             if goal.handle is not None and not (goal.cancelled or goal.over):
                 self._await(goal.handle.cancel_goal_async(), self._on_cancelled, goal)

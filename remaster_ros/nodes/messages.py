@@ -67,7 +67,10 @@ def read_place(position: Any, turn: Any) -> FloatArray:
 
 
 def transform_message(parent: str, child: str, T_parent_child: FloatArray) -> TransformStamped:
-    """Return a transform (4, 4), of frame `child` in `parent`, as a message with the stamp 0."""
+    """Return a transform as a message, of the frame `child` in the frame `parent`.
+
+    ``T_parent_child``: (4, 4), m; the stamp of the message is 0.
+    """
     message = TransformStamped()
     message.header.frame_id, message.child_frame_id = parent, child
     write_place(T_parent_child, message.transform.translation, message.transform.rotation)

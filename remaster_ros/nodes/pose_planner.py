@@ -281,7 +281,10 @@ class PosePlanner(RemasterNode):
             self.create_service(Trigger, path, partial(self._on_confirm, plan=plan))
 
     def _on_pause(self, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Serve a request to pause the run; refused if none is running."""
+        """Serve a request to pause the run, also one that waits to be resumed.
+
+        It succeeds if the run is paused then or was before; else the response has the state.
+        """
         with self._lock:
             response.success = self.run.pause()
             self._follow_run()
@@ -366,7 +369,10 @@ class PosePlanner(RemasterNode):
                 self._on_recorder(recorder)
 
     def _on_recorder(self, recorder: events.RecorderState) -> None:
-        """Update the progress by the recorder's state; evaluate a finished inspection."""
+        """Update the progress by the recorder's state; evaluate a finished inspection.
+
+        A change of the setup in this run ends the run as paused; new outcomes lead to `_step`.
+        """
         if self.run.token and recorder.changed_run == self.run.token:
             # The change was found while no planner was running; collect begins another run.
             self._end('paused', recorder.changed)
@@ -535,7 +541,10 @@ class PosePlanner(RemasterNode):
         return Summary(level, why or run.state, values, self.progress.state(shown, run.token))
 
     def close(self) -> None:
-        """Publish that the planner has stopped, at which the bridge stops the arm."""
+        """Publish that the planner has stopped, at which the bridge stops the arm.
+
+        A run under way ends as stopped, which is written to the journal; the journal is released.
+        """
         self._end('stopped')
         self._write_state()
         self._inspections.close()

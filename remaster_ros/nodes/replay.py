@@ -406,7 +406,10 @@ def _record(data: bytes) -> events.EventRecord | None:
 
 
 def _live(info: TopicEndpointInfo, does: str) -> str:
-    """Error message that a node makes this graph live; ``does``: its doing, as 'publishes X'."""
+    """Error message that a node makes this graph live, with the remedy.
+
+    ``does``: its doing as a phrase, such as 'publishes /joint_states'.
+    """
     return (
         f'replay: this graph is live: {node_of(info)} {does}; end it, or replay in another ROS '
         'domain (ROS_DOMAIN_ID) or namespace'

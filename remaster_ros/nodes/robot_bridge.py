@@ -785,14 +785,17 @@ class RobotBridge(RemasterNode):
         self._disk.submit(write, self._on_end_written)
 
     def _on_end_written(self, result: object) -> None:
-        """Log an error if the last commanded position could not be written."""
+        """Log an error if `result` is the exception of writing the last command's file."""
         if isinstance(result, Exception):
             self.get_logger().error(
                 f'{self._command_file.path}: where the arm was led last is not kept ({result})'
             )
 
     def _is_late(self, command: Drive | Renew | Stop) -> bool:
-        """Whether a command was decided too long ago to be published (`LATE_WALL_S`)."""
+        """Whether a command was decided too long ago to be published (`LATE_WALL_S`).
+
+        A move with a stamp has the limit of a renewal, since it begins at a time.
+        """
         limit_s = LATE_WALL_S[type(command)]
         if isinstance(command, Drive) and command.begins_s:
             # It begins at a time, and not when it comes.
@@ -894,7 +897,10 @@ class RobotBridge(RemasterNode):
         )
 
     def _summary(self) -> Summary:
-        """Summary for the status: counts, what blocks the arm, and the bridge's state."""
+        """Summary for the status: counts, what blocks the arm, and the bridge's state.
+
+        The level is error if halted, warn if blocked, else ok.
+        """
         supervisor, now = self.supervisor, self.steady_s()
         blocked = supervisor.blocked(now)
         text = 'moving or measuring' if supervisor.busy else 'waiting for a pose'
@@ -929,7 +935,7 @@ class RobotBridge(RemasterNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node; return its exit status, see `running.run`."""
     # A path check must not keep a stop waiting for the interpreter: 1 ms instead of 5.
     sys.setswitchinterval(1e-3)
     make: Callable[[], RemasterNode] = RobotBridge

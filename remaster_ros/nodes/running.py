@@ -149,7 +149,10 @@ class RemasterNode(Node):
 
     @property
     def clock_trouble(self) -> str:
-        """Why the node has no time (no simulated clock received yet), or ''."""
+        """Why the node has no time (no simulated clock received yet), or ''.
+
+        It has one once its clock is above 0.
+        """
         if self.get_clock().now().nanoseconds > 0:
             return ''
         topic = self.resolve_topic_name('/clock')
@@ -207,7 +210,10 @@ def _answering(node: RemasterNode, callback: Callable[..., Any]) -> Callable[...
 def _leaving_out(
     node: RemasterNode, topic: str, callback: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Return a topic's callback that reports a message with an InputError, and drops it."""
+    """Return a topic's callback that drops a message for which `callback` raises InputError.
+
+    The error is logged (`on_unreadable`); other exceptions are raised.
+    """
 
     @wraps(callback)
     def take(*message: Any) -> Any:
@@ -282,7 +288,7 @@ class _Threads(_Takes, MultiThreadedExecutor):
     """Executor of several threads that waits at its end for the callbacks under way."""
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
-        """Stop executing callbacks and wait for their end."""
+        """Stop executing callbacks and wait for the end of those under way; then as in rclpy."""
         self._executor.shutdown(wait=True, cancel_futures=True)
         # What was in the queue never runs; without this Python complains of each of them.
         for task, _, _ in self._tasks:

@@ -226,7 +226,7 @@ class MeasureService:
         return reading.stamp_s
 
     def _publish_temperature(self, reading: MarkerReading) -> None:
-        """Publish a reading's temperature under the reading's stamp; nothing if it has none."""
+        """Publish a reading's temperature, °C, under the reading's stamp; nothing without one."""
         if not math.isfinite(reading.temperature_c):
             return
         message = Temperature(temperature=float(reading.temperature_c))

@@ -219,7 +219,7 @@ class NodeStatus:
         return sum((info.node_name, info.node_namespace) == own for info in found)
 
     def publish(self) -> None:
-        """Publish the state now; from any thread."""
+        """Publish the state now, on remaster/events and remaster/status; from any thread."""
         with self._order:
             summary = self._summary()
             self._publish_record(summary.state)

@@ -229,7 +229,11 @@ class Watch(RemasterNode):
         self._waypoints = message
 
     def _on_solutions(self, message: JointTrajectory) -> None:
-        """Show the path from the arm's position through all solutions of the pose."""
+        """Show the path from the arm's position through all solutions of the pose.
+
+        With the waypoints of the same stamp between them; without a position it begins at the
+        first solution. Raises InputError as `solutions_of`.
+        """
         names, waypoints = self.chain.joint_names, self._waypoints
         targets = solutions_of(message, names)
         belongs = waypoints.header.stamp == message.header.stamp
@@ -331,7 +335,10 @@ class Watch(RemasterNode):
 
 
 def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
-    """Return a callback that drops invalid messages, which other nodes report."""
+    """Return a callback that drops messages for which `callback` raises; nothing is logged.
+
+    Of RemasterError, ValueError and msgspec's errors: other nodes report these messages.
+    """
 
     def receive(message: Any) -> None:
         with contextlib.suppress(RemasterError, ValueError, msgspec.MsgspecError):

@@ -88,7 +88,10 @@ class DesignResult:
     tool_rms: float  # Expected RMS error of the predicted markers, m
 
     def describe(self) -> str:
-        """Return the expected precision in one line."""
+        """Return the expected precision in one line: deg of the offsets, mm of the markers.
+
+        With the goal if that is not reached.
+        """
         goal = '' if self.reached else f'; not reached: {self.goal.describe()}'
         return (
             f'expected std of the offsets {np.degrees(self.joint_rms):.4f} deg (RMS), '

@@ -120,7 +120,10 @@ class Goal:
         return self.is_met(information.joint_rms(chosen), information.tool_rms(chosen))
 
     def describe(self) -> str:
-        """Return the goal as text."""
+        """Return the goal as text, such as '0.01 deg for the offsets and 0.1 mm for the tool'.
+
+        Only what has a weight (`tool_share`).
+        """
         joints = f'{np.degrees(self.joint_std_rad):.3g} deg for the offsets'
         tool = f'{self.tool_std_m * 1e3:.3g} mm for the tool'
         counting = [joints] * (self.tool_share < 1.0) + [tool] * (self.tool_share > 0.0)
@@ -204,7 +207,10 @@ class _Units:
         return float(np.mean(np.sum(along, axis=(1, 2))))
 
     def near(self, index: int) -> FloatArray:
-        """Return the time from one unit to each unit, s, (n,); infinite to itself."""
+        """Return the time from one unit to each unit, s, (n,); infinite to itself.
+
+        Between their nearest configurations, by a straight line; computed once for each.
+        """
         if index not in self._near:
             # The nearest pair is found without the limit of the tool's speed, which takes long.
             q, solutions_of_unit = np.concatenate(self._q), self._q[index]
@@ -275,7 +281,7 @@ class _Search:
         return near + self._units.stay_s
 
     def is_done(self, chosen: Sequence[int]) -> bool:
-        """Return whether chosen units reach goal and floors."""
+        """Whether chosen units reach goal and floors."""
         return self._floors.hold(self._poses(chosen)) and self._goal.is_reached(
             self._information, chosen
         )
@@ -307,7 +313,11 @@ class _Search:
         )
 
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
-        """Whether each unit brings the design nearer to the floors, (n,)."""
+        """Whether each unit brings the design nearer to the floors, (n,).
+
+        A new pose while poses are few; a pose with one chosen solution, or whole with several,
+        while repeated ones are.
+        """
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
         poses, repeated = np.sum(count > 0), np.sum(count > 1)
@@ -381,7 +391,10 @@ class _Search:
         return without[int(np.argmin(np.where(has_floors | ~has_floors.any(), cost, np.inf)))]
 
     def spent(self, chosen: Sequence[int]) -> float:
-        """Return the robot time of units, each reached from its nearest neighbour, s."""
+        """Return the robot time of units, each reached from its nearest neighbour, s.
+
+        With measuring; without travel for a single unit.
+        """
         which = np.array(chosen, dtype=np.int64)
         near = np.min([self._units.near(index)[which] for index in chosen], axis=0)
         ways = float(np.sum(near)) if len(chosen) > 1 else 0.0

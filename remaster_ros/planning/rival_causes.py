@@ -130,7 +130,10 @@ class Rivals:
 def rivals_of(
     context: Context, cause: FoundCause, look_alike: tuple[str, tuple[int, ...]]
 ) -> Rivals | None:
-    """Return the pair of a cause and a look-alike; None if the context lacks data for one."""
+    """Return the pair of a cause and a look-alike; None if the context lacks data for one.
+
+    ``look_alike``: its name and joints, 1-based.
+    """
     found = _found_candidates(context, cause)
     other = _largest_candidate(context, *look_alike)
     if not found or other is None:

@@ -332,7 +332,10 @@ class _Choice:
     def _as_poses(
         self, chosen: Sequence[int]
     ) -> tuple[tuple[PlannedPose, ...], tuple[tuple[int, int], ...]]:
-        """Return the poses of chosen configurations, and the order of the visits."""
+        """Return the poses of chosen configurations, and the order of the visits.
+
+        ``chosen``: indices, in their order; the order has pose and solution of each, from 0.
+        """
         numbers = list(dict.fromkeys(int(self.number[index]) for index in chosen))
         members = [[i for i in chosen if self.number[i] == number] for number in numbers]
         poses = tuple(

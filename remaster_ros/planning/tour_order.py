@@ -144,7 +144,10 @@ class Tour:
 
     @property
     def inspection(self) -> Literal['', 'verify', 'check']:
-        """Inspection that the tour serves, with all its poses held out; '' for a calibration."""
+        """Inspection that the tour serves, with all its poses held out; '' for a calibration.
+
+        ``verify`` if any of its poses states a correction, else ``check``.
+        """
         if FITTED not in self.plans or self.plans[FITTED].poses:
             return ''
         held_out = self.plans.get(HELD_OUT, Plan(())).poses
@@ -223,7 +226,10 @@ class Tour:
         return [v for v in self.order if v[2] in self._unvisited[v[0]].get(v[1], ())]
 
     def _due(self, split: str, index: int) -> list[int]:
-        """Return the solutions of a pose to visit now: all, or those consecutive in the order."""
+        """Return the solutions of a pose to visit now: all, or those consecutive in the order.
+
+        Indices, of those not visited.
+        """
         if not self.order:
             return self._unvisited[split][index]
         run = takewhile(lambda visit: visit[:2] == (split, index), self._in_order())
@@ -384,7 +390,7 @@ class Tour:
         return Route(reached, paths, [number for number in ids if number not in reached])
 
     def describe(self) -> str:
-        """Return the counts of planned and dropped poses in one line."""
+        """Return the counts of planned and dropped poses in one line, with reasons."""
         kept = ', '.join(
             f'{counted(count, f"{split} pose")} with '
             f'{counted(self.configurations[split], "configuration")}'

@@ -154,7 +154,11 @@ def visit_order(
 def _is_free(
     model: CollisionModel, q: FloatArray, times: FloatArray, first: range, second: range
 ) -> bool:
-    """Return whether the straight path between the nearest pair of two places is free."""
+    """Whether the straight path between the nearest pair of two places is free.
+
+    ``times``: between all visits, s, (n, n); ``first, second``: their visits, indices into q (n,
+    k).
+    """
     between = times[first.start : first.stop, second.start : second.stop]
     a, b = np.unravel_index(int(np.argmin(between)), between.shape)
     return is_straight_free(model, q[first[int(a)]], q[second[int(b)]])

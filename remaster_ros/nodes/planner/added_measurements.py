@@ -88,7 +88,10 @@ class AddedMeasurements:
         return self._tours.separating_tour(T_R_N, causes, rows, previous, most)
 
     def describe_tour(self, tour: Tour) -> str:
-        """Return a tour of the collection and its expected precision in one line."""
+        """Return a tour's counts and its expected precision in one line.
+
+        Of additions the separations (`describe`); no precision without an optimal design.
+        """
         design = self._tours.design_result
         expected = '' if design is None else design.describe()
         if tour.begin_at:

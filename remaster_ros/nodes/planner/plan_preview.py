@@ -60,7 +60,10 @@ class PlanPreview(PlanConfirmation):
         return {'plan_page': page, 'plan_shown': self.shown, 'confirmed': confirmed}
 
     def collect_refusal(self) -> str:
-        """Return why collect is refused, '' if it is not; a failed page is drawn again."""
+        """Return why /remaster/collect is refused, '' if it is not; see `refusal`.
+
+        If the page could not be drawn, it is drawn again.
+        """
         refusal = self.refusal()
         if self.trouble:
             self.withdraw()

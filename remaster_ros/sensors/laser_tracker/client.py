@@ -399,7 +399,11 @@ class TrackerLink:
         self._lose(reason)
 
     def _drain(self, reader: PacketReader) -> str:
-        """Handle every complete packet; reason why the connection ended, or ''."""
+        """Handle every complete packet; reason why the connection ended, or ''.
+
+        It ends at the close by the instrument, or if the boundaries of packets are lost; other
+        damaged packets are counted.
+        """
         while True:
             try:
                 event = reader.next_event()
@@ -692,7 +696,11 @@ class LaserTrackerClient:
             raise
 
     def _try_search(self, expected: FloatArray | None) -> LaserTrackerError | None:
-        """Search once; the instrument's refusal is returned, a lost connection raised."""
+        """Search once; the instrument's refusal is returned, a lost connection raised.
+
+        At `expected`, m, (3,), or in the present direction for None; None if it found one. Waits
+        `_RETRY_S` after a refusal.
+        """
         try:
             if expected is None:
                 self.find_reflector()

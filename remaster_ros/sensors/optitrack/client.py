@@ -153,7 +153,10 @@ class NatNetClient(MarkerFollower):
         return not server.connection.is_multicast
 
     def _is_due(self, what: str, now: float, every_s: float) -> bool:
-        """Whether a kind of request is due at `now`, s; the next is due `every_s` after it."""
+        """Whether a kind of request is due at `now`, s; the next is due `every_s` after it.
+
+        ``what``: key of `_due`; ``now``: `time.monotonic`.
+        """
         if now < self._due[what]:
             return False
         self._due[what] = now + every_s

@@ -163,7 +163,10 @@ class SourceLock:
         return tuple(candidates) if len(candidates) > 1 else ()
 
     def _candidates(self, now_s: float) -> list[Source]:
-        """Sources that could get the lock: heard lately, and never beside another holder."""
+        """Sources that could get the lock: heard lately, and never beside another holder.
+
+        Lately is in the last `silence_s`.
+        """
         return [
             source
             for source, other in list(self._others.items())
@@ -464,7 +467,11 @@ class MarkerGate:
         return None
 
     def _frozen(self, reading: MarkerSample) -> Dropped | None:
-        """`Dropped.FROZEN` from the repeat `FROZEN_FRAMES` of the last position on, else None."""
+        """`Dropped.FROZEN` if the position is that of many readings before, else None.
+
+        From the repeat `FROZEN_FRAMES` on, to the last bit. Counts repeats: called once per
+        reading.
+        """
         last = self._last_reading
         same = last is not None and np.array_equal(reading.position, last.position)
         self._repeats = self._repeats + 1 if same else 0

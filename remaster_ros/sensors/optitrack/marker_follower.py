@@ -142,7 +142,10 @@ def _unanswered(status: StreamStatus, settings: NatNetSettings) -> Diagnosis:
 def _no_frames(
     status: StreamStatus, settings: NatNetSettings, server: ServerInfo, version: Version
 ) -> Diagnosis:
-    """Diagnosis of a server that answers but whose frames do not arrive (any more)."""
+    """Diagnosis of a server that answers but whose frames do not arrive (any more).
+
+    In this order: transport, group, port, version, other sources, silence, network card.
+    """
     multicast = settings.transport == 'multicast'
     connection = server.connection
     if connection is not None and connection.is_multicast != multicast:
@@ -234,7 +237,7 @@ def warning(status: StreamStatus) -> str:
 
 
 def _no_marker(status: StreamStatus) -> Diagnosis:
-    """Diagnosis of whole frames without a usable marker."""
+    """Diagnosis of whole frames without a usable marker, by the last reason of the gate."""
     name = 'the marker' if status.marker_id is None else f'marker {_label(status.marker_id)}'
     reason = status.last_reason
     if reason == Dropped.NOT_PRESENT:

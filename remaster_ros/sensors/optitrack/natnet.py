@@ -500,7 +500,7 @@ class _Layout(NamedTuple):
 
 @cache
 def _layout(version: Version) -> _Layout:
-    """Layout of a frame in a version."""
+    """Layout of a frame in a version, computed once; the version has to be supported."""
     since_3, since_4_1 = version >= (3, 0), version >= (4, 1)
     section = SizedList if since_4_1 else List
     body = _BODY_3 if since_3 else _BODY_2
@@ -643,7 +643,7 @@ class ModelDefinition:
 
     @property
     def labelled_assets(self) -> dict[str, int]:
-        """Ids by name of rigid bodies and (4.1+) trained marker sets."""
+        """Ids by name of rigid bodies and (4.1+) trained marker sets; a rigid body wins a name."""
         named = {
             d.name: d.id
             for d in self.descriptions
@@ -710,7 +710,7 @@ _KINDS: dict[type, int] = {
 
 @cache
 def _codecs(version: Version) -> dict[int, Codec]:
-    """Codec of each kind of description in a version."""
+    """Codec of each kind of description in a version, by the wire's type number."""
     body = _rigid_body(version)
     codecs: dict[int, Codec] = {
         MARKER_SET: Record(MarkerSetDescription, TEXT, List(TEXT)),
@@ -1029,7 +1029,7 @@ def _text(payload: bytes) -> str:
 
 
 def _wanted_version(payload: bytes) -> Version | None:
-    """Wanted bitstream in the full form of CONNECT; None in shorter forms."""
+    """Wanted bitstream in the full form of CONNECT; None in shorter forms, or for 0.0."""
     if len(payload) < _SENDER.size + _OPTIONS.size:
         return None
     _subscribed, major, minor, _build, _revision = _OPTIONS.unpack_from(payload, _SENDER.size)

@@ -228,7 +228,7 @@ class _Packet:
 
 
 def _read(client: Any, datagram: bytes) -> tuple[LabeledMarker, ...] | None:
-    """Labelled markers of a datagram by natnetclient, or None if it fails."""
+    """Labelled markers of a datagram by natnetclient, or None if it fails in any way."""
     client.labeled_markers.clear()
     try:
         client.parse(datagram)

@@ -37,7 +37,10 @@ def resolve(host: str) -> str:
 
 
 def interface_towards(server_ip: str, port: int) -> str:
-    """Address of this machine from which packets reach the server; raises `DeviceError`."""
+    """IPv4 address of this machine from which packets reach the server.
+
+    Nothing is sent. Raises DeviceError if there is no route.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect((server_ip, port))
