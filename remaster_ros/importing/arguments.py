@@ -41,7 +41,8 @@ _LEFT_OUT = '; to write it as it is, add --unchecked'
 def in_python(sentence: str, arguments: Collection[str]) -> str:
     """Sentence with arguments of a function in place of options of the command.
 
-    `arguments` are those that the function has; other options are written as the command's.
+    `arguments`: those that the function has; other options become ``remaster import --option``.
+    The advice to add --unchecked is taken out.
     """
     if 'join' not in arguments:
         sentence = sentence.replace('say --join order', _BY_ORDER)
@@ -58,7 +59,11 @@ def in_python(sentence: str, arguments: Collection[str]) -> str:
 
 
 def remedy(options: str, arguments: Collection[str]) -> str:
-    """Options proposed by `sense`, with their values, as arguments of a function; '' if none."""
+    """Options proposed by `sense`, with their values, as arguments of a function; '' for ''.
+
+    For example ``couple={'A3': 'A2'}`` of ``--couple A3=A2``. Options that are not among
+    `arguments` are written as ``remaster import --option value``.
+    """
     words = shlex.split(options)
     found: dict[str, list[str]] = {}
     for word in words:

@@ -84,7 +84,11 @@ class SessionOptions:
         offset_deg: Mapping[str, float] | None,
         sensor_kind: Literal['', SensorKind] = '',
     ) -> SessionOptions:
-        """Options with the joint corrections in the form of the Python functions' arguments."""
+        """Options with the joint corrections in the form of the Python functions' arguments.
+
+        `couple`: joint -> joint to be added to it, with a minus sign in front to subtract it;
+        `offset_deg`: joint -> angle to be added, degrees.
+        """
         added: dict[str, tuple[str, Literal[1, -1]]] = {
             name: (other.lstrip('+-'), -1 if other[:1] == '-' else 1)
             for name, other in (couple or {}).items()
@@ -100,8 +104,9 @@ class SessionOptions:
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
     """How the controller counts the joints, by the table's columns and the user's corrections.
 
-    None if it counts them as the URDF does, as in a bag without corrections. Raises InputError if
-    corrections are given for an arm with a prismatic joint.
+    None if it counts them as the URDF does (a bag, or a joint that slides, without corrections).
+    Raises InputError for corrections of an arm with a prismatic joint, of an unknown joint, or of
+    joints that are coupled in a circle.
     """
     told = options.couple or options.reverse or options.add_deg
     if chain.slides.any():
@@ -139,9 +144,10 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
 
 
 def _joint_index(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
-    """Index of a joint by the name of its column or in the URDF.
+    """Index, from 0, of a joint by the name of its column or in the URDF.
 
-    Raises InputError if there is none.
+    Columns first, with or without their unit; case is ignored. Raises InputError, with `option`,
+    if there is none.
     """
     for names in (rows.joint_columns, chain.joint_names):
         folded = [known.casefold() for known in names]
@@ -163,12 +169,17 @@ def assemble(
     rng: np.random.Generator,
     notes: str,
 ) -> tuple[Session, list[str]]:
-    """Session from rows, and sentences on how poses were found and held out.
+    """Session from rows, and two sentences: how poses were found, and how rows were held out.
+
+    Joint positions and torques are converted to those of the URDF. The limits, and whether the
+    table fits the robot, are not checked. Markers whose position is unknown are at the tip, with a
+    standard deviation of 0.3 m; others have 0.5 mm if none is stated. `rng`: draws held-out poses.
 
     Raises
     ------
     InputError
-        Labels that contradict each other, naming the row.
+        Labels that contradict each other, naming the row, or corrections of joints that the arm
+        does not have.
     """
     controller = controller_of(rows, chain, options)
     pad = PadAngles.of(controller, chain.joint_names)
@@ -238,7 +249,11 @@ def assemble(
 def _kinds(
     sensors: Sequence[str], rows: RawRows, options: SessionOptions
 ) -> dict[str, SensorKind]:
-    """Return kinds of instruments: by the option, by their names, or by whose file it is."""
+    """Kind of instrument of each sensor, by name; sensors of an unknown kind are left out.
+
+    By the option, else by words in its name if these are of one kind only, else by whose file it
+    is; else a camera if the sensor is on the tool.
+    """
     kinds: dict[str, SensorKind] = {}
     for name in sensors:
         by_name = [kind for kind, words in _WORDS_OF_KINDS.items() if words.search(name)]
@@ -254,8 +269,9 @@ def with_controller_coupling(
 ) -> tuple[SessionOptions, list[str]]:
     """Options with the joint coupling of the file's controller if it fits, and a sentence on it.
 
-    The URDF may contain the coupling already: the options stay as they are if the points then fit
-    better without it.
+    The URDF may contain the coupling already: the options stay as they are, with [], if the points
+    then fit better without it (from 12 rows on), if there is no coupling, if the user stated one,
+    or if a joint slides.
     """
     coupling = tuple(rows.coupling.items())
     if options.couple or not coupling or chain.slides.any():
@@ -294,14 +310,21 @@ def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, 
 
 
 def _measurement_date(rows: RawRows) -> str:
-    """Date of the first row, ISO 8601; '' if the times do not count from 1970."""
+    """Local date and time of the first row, ISO 8601, to the second.
+
+    '' without times, or if they are before 3 January 2000: they do not count from 1970 then.
+    """
     if rows.stamp_s is None or rows.stamp_s[0] < FIRST_DATE_S:
         return ''
     return datetime.fromtimestamp(float(rows.stamp_s[0])).isoformat(timespec='seconds')
 
 
 def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> None:
-    """Raise InputError for the first row with a joint angle outside the URDF's limits."""
+    """Raise InputError for the first row with a joint position outside the URDF's limits.
+
+    `q`: positions as the URDF counts them, rad or m, (n, k). `SerialChain.limit_tolerance` is
+    allowed.
+    """
     allowed = chain.limit_tolerance
     outside = (q < chain.lower - allowed) | (q > chain.upper + allowed)
     for row, joint in np.argwhere(outside)[:1]:
@@ -324,7 +347,12 @@ def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> N
 
 
 def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, str]:
-    """Pose index of each row, (n,), and a sentence on how poses were found."""
+    """Index of the pose of each row, (n,), in order of first occurrence, and a sentence on it.
+
+    By the label ``pose``; else a row has the pose of an earlier one if the nominal tool poses
+    differ by less than 2 mm (`SAME_POSE_M`), 5 mrad counting as 2 mm, as the root of the sum of
+    squares.
+    """
     if 'pose' in rows.labels:
         pose, names = _indices_of_names(rows.labels['pose'])
         return pose, f'{counted(len(names), "pose")}, as the table numbers them'
@@ -353,9 +381,10 @@ def _frames(
     marker: IntArray,
     configuration: IntArray,
 ) -> IntArray | None:
-    """Frame index of each row, (n,): rows of one frame are markers seen by a sensor at one moment.
+    """Index of the frame of each row, (n,): rows that a sensor measured at one moment.
 
-    -1 for a row that is alone in its frame; None if all are, or if times are unknown.
+    -1 for a row that is alone in its frame. None if all are, if times are unknown, or if a marker
+    is in a frame twice. `moment`: time or number of the reading of each row, (n,).
     """
     if moment is None:
         return None
@@ -367,7 +396,11 @@ def _frames(
 
 
 def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
-    """Configuration index of each row: by label, else runs of equal joints and pose."""
+    """Index of the configuration of each row, (n,), from 0.
+
+    By the label ``configuration`` within a pose; else a new one begins where joints or pose
+    change, or where sensor and marker are those of the row before.
+    """
     if 'configuration' in rows.labels:
         labels = list(zip(pose.tolist(), rows.labels['configuration'], strict=True))
         index: dict[tuple[int, str], int] = {}
@@ -386,7 +419,12 @@ def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
 def _splits(
     rows: RawRows, pose: IntArray, share: float, rng: np.random.Generator
 ) -> tuple[BoolArray, str]:
-    """Mask of the held-out rows, (n,), and a sentence on how they were chosen."""
+    """Mask of the held-out rows, (n,), and a sentence on how they were chosen.
+
+    By the label ``split``, else a random pose of each of consecutive runs of poses, as many as the
+    `share` of them. None is held out for a share of 0 or fewer than 12 poses. Raises InputError
+    for an unknown split, or two splits in a pose.
+    """
     if 'split' in rows.labels:
         given = [_SPLITS.get(text.strip().lower(), -1) for text in rows.labels['split']]
         for row, split in enumerate(given):
@@ -424,7 +462,7 @@ def _splits(
 
 
 def _previous_configuration(configuration: IntArray, q: FloatArray) -> FloatArray:
-    """Joints of the configuration before, (n, k); NaN for the first."""
+    """Joints of the last row of the configuration before, (n, k); NaN for the first one."""
     from_q = np.full_like(q, np.nan)
     first = np.flatnonzero(np.diff(configuration, prepend=configuration[0]) != 0)
     for start, end in zip(first, [*first[1:], len(q)]):

@@ -55,7 +55,10 @@ SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file of one, or a folder that holds one."""
+    """Whether a path is a bag, by its name alone: a file, or a folder that holds one.
+
+    Files end in .mcap, .db3 or .bag; a folder may have a metadata.yaml instead.
+    """
     if path.is_dir():
         return (path / 'metadata.yaml').exists() or any(
             any(path.glob(f'*{suffix}')) for suffix in SUFFIXES
@@ -71,14 +74,21 @@ class _Topic:
     values: list[Any] = field(default_factory=list)
 
     def stream(self, scale: float = 1.0) -> Stream:
-        """Values in the order of their stamps, the first three columns times a scale."""
+        """Values in the order of their stamps, the first three columns times `scale`.
+
+        Messages with a value that is not finite are left out.
+        """
         values = np.array(self.values, dtype=float)
         values[:, :3] *= scale
         return Stream.of(np.array(self.stamps), values)
 
 
 def _place(message: Any, where: str) -> tuple[float, ...]:
-    """Position x, y, z and, for a pose, quaternion x, y, z, w; NaN if its length is not 1."""
+    """Position x, y, z and, for a pose, quaternion x, y, z, w: 3 or 7 numbers.
+
+    The quaternion is NaN if its length differs from 1 by over 1e-3. `where`: dotted path to the
+    field, such as ``pose.pose``.
+    """
     for name in where.split('.'):
         message = getattr(message, name)
     place = getattr(message, 'position', getattr(message, 'translation', message))
@@ -93,7 +103,11 @@ def _place(message: Any, where: str) -> tuple[float, ...]:
 
 
 def _places(topic: str, kind: str, message: Any) -> Iterator[tuple[str, Any, tuple[float, ...]]]:
-    """Yield name, header and place, as `_place`, of each place in a message."""
+    """Yield name, header and place, as `_place`, of each place in a message.
+
+    The name is the topic, the child frame of a transform, or ``topic/name`` of a body or marker.
+    `kind`: type of the message, one of `PLACES` or `SEVERAL`.
+    """
     if kind in PLACES:
         yield topic, message.header, _place(message, PLACES[kind])
         return
@@ -116,7 +130,10 @@ def read_bag(
     clock_offset_s: float | None = None,
     links: Container[str] = (),
 ) -> RawRows:
-    """Read a bag; each topic of points, or each name in a message of several, is a sensor.
+    """Rows of a bag: the mean point of each sensor at each standstill of the joints, in order.
+
+    Each topic of points, or each name in a message of several, is a sensor. Markers that stay in
+    their place are left out where they come in messages of several.
 
     Parameters
     ----------
@@ -132,7 +149,8 @@ def read_bag(
     Raises
     ------
     InputError
-        No such topics, no standstill with a point in it, or a damaged bag.
+        No such topics or several, no standstill (0.5 s) with a point in it, numbers beyond any arm
+        or sensor, an arm with a prismatic joint, or a damaged bag.
     """
     refuse_sliding(chain, path)
     bag = _Bag.of(path, chain, joint_topics, point_topics, length, links)
@@ -219,7 +237,11 @@ class _Bag:
         length: str,
         links: Container[str],
     ) -> _Bag | RawRows:
-        """Read a bag; return rows if it holds measurements of robot_calibration."""
+        """Read a bag; return rows if it holds measurements of robot_calibration.
+
+        Raises InputError for a damaged bag, without joint states of this arm or points, for
+        several topics of joint states or of poses, and for numbers beyond any arm or sensor.
+        """
         joints: dict[str, _Topic] = defaultdict(_Topic)
         found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in _KINDS}
         calibration: list[tuple[float, Any]] = []
@@ -280,9 +302,9 @@ class _Bag:
 def _require_sensible(
     path: Path, joints: _Topic, points: Mapping[str, _Topic], scale: float
 ) -> None:
-    """Raise InputError for angles or points too large to be real, before anything is computed.
+    """Raise InputError for joint angles above 1e4 rad, or points above 200 m in any axis.
 
-    NaN, for a point that was not seen, is allowed.
+    NaN, for a point that was not seen, is allowed. `scale`: unit of the points, m.
     """
     angles = np.array(joints.values, dtype=float)
     if np.any(np.abs(angles) > LARGEST_RAD):
@@ -300,14 +322,14 @@ def _require_sensible(
 
 
 def _stamp(header: Any, log_s: float) -> float:
-    """Stamp of a header, s; the time of recording if the header has none."""
+    """Stamp of a header, s; `log_s`, the time of recording, if the stamp is 0."""
     return float(header.stamp.sec + 1e-9 * header.stamp.nanosec or log_s)
 
 
 def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any, float]]:
-    """Yield topic, type, message and time, s, of joint states and points.
+    """Yield topic, type, message and time of recording, s, of joint states and points.
 
-    Fill `seen` with topics.
+    Puts topic -> type of all topics into `seen`. Raises InputError for a damaged bag.
     """
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
@@ -348,7 +370,10 @@ def _topics(seen: dict[str, str]) -> str:
 def _joint_topic(
     path: Path, joints: dict[str, _Topic], seen: dict[str, str], chain: SerialChain
 ) -> str:
-    """The only topic with the robot's joints. Raises InputError for none or several."""
+    """The only topic with the robot's joints, or the only one that ends in ``joint_states``.
+
+    Raises InputError for none or several.
+    """
     named = [topic for topic in joints if topic.endswith('joint_states')] or list(joints)
     if len(named) == 1:
         return named[0]
@@ -381,7 +406,12 @@ class _Rows:
         self._matched: list[str] = []
 
     def add(self, topic: str, stream: Stream) -> None:
-        """Add the mean point of each standstill in the stream of one topic."""
+        """Add the mean point of each standstill of the joints in the stream of one topic.
+
+        The first 0.5 s of a standstill are not used. One at which the marker was not still
+        (`standstills.reading_of`) is counted and left out, as is one without points. Raises
+        InputError if the clocks' offset is not found.
+        """
         still = self._still
         if not len(still) or not len(stream.stamps):
             return
@@ -410,7 +440,11 @@ class _Rows:
             self._rows.append((j, topic, place, std, len(kept), turn))
 
     def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
-        """All rows, sorted by standstill. Raises InputError if no point was measured at one."""
+        """All rows, sorted by standstill and topic. Raises InputError if there are none.
+
+        `topics`: those of the points; `length`: their unit; `seen`: topic -> type of the other
+        topics.
+        """
         path, chain, joint_topic = self._path, self._chain, self._joint_topic
         if not self._rows:
             raise InputError(

@@ -26,10 +26,14 @@ def wide(
 ) -> tuple[list[str], Rows, list[int]] | None:
     """Names, rows and lines of a table with a row for each point; None for other tables.
 
+    Of a table of at least 9 rows, over half of them of X, Y or Z: each point has them one below
+    the other in this order. The name of the point comes first; a column of numbers becomes three,
+    ``name X`` and so on. `lines`: line of each row in the file; the result has those of X.
+
     Raises
     ------
     InputError
-        A point without one of its axes, with its line.
+        A point without one of its axes, or out of order, with its line.
     """
     if len(rows) < _FEWEST_POINTS * len(_AXES):
         return None
@@ -80,10 +84,10 @@ def wide(
 
 
 def _axes(rows: Rows) -> tuple[list[str], int, list[str] | None] | None:
-    """Axis of each row ('' if none), and index of the column with the axes.
+    """Axis of each row, 'X', 'Y', 'Z' or '', and index of the column with the axes, from 0.
 
-    Last result: names of the points, if that column has them. None if the table has no such
-    column.
+    Last result: names of the points if that column has them (``P1.X``), else None. None if no
+    column has an axis in over half of the rows.
     """
     for column, cells in enumerate(zip(*rows)):
         axes = [cell.upper() if cell.upper() in _AXES else '' for cell in cells]

@@ -26,16 +26,18 @@ def rows_of(
     sensors: Sequence[str] = (),
     length: str = '',
 ) -> RawRows:
-    """Rows of messages of robot_calibration, given as pairs of time, s, and message.
+    """Rows of messages of robot_calibration, given as pairs of time of recording, s, and message.
 
     The markers of a sensor are the places in its list of points, as a finder lists the corners of
-    a board. Points that stand still come from the arm's own model and are left out. `sensors` are
-    the names of the sensors to use; () for all.
+    a board. Points that stand still (extent below 2 % of the largest) come from the arm's own
+    model and are left out, as are points that are not finite. `sensors`: names of the sensors to
+    use, () for all; `length`: unit of the points, '' for m.
 
     Raises
     ------
     InputError
-        A message without the robot's joints, or no sensor with points that move.
+        A message without the robot's joints, an unknown sensor, no sensor with points that move,
+        or points beyond 200 m.
     """
     joints, stamps = [], []
     places: dict[tuple[str, int], dict[int, tuple[float, float, float]]] = defaultdict(dict)

@@ -141,7 +141,7 @@ class Columns:
         return tuple(flat.from_iterable(self.points.values()))
 
     def first_of_kind(self, kind: str) -> int | None:
-        """The first column of a kind such as ``time``; None if there is none."""
+        """Index of the first column of a kind such as ``time``; None if there is none."""
         return next(iter(self.others.get(kind, ())), None)
 
 
@@ -223,13 +223,13 @@ class _Header:
 
     @classmethod
     def of(cls, text: str) -> _Header:
-        """Parse a header."""
+        """Words and numbers of a header, lower case (tcp, pos, 1 of ``tcpPos1``), and its unit."""
         name, unit = split_unit(text)
         words = _TOKEN.findall(_CAMEL.sub(' ', name))
         return cls(tuple(word.lower() for word in words), unit)
 
     def kind(self) -> str:
-        """Kind of a column other than joints and points, such as ``time``; '' if it has none."""
+        """Kind of a column other than joints and points, a key of `_WORDS`; '' if it has none."""
         words = [word for word in self.words if word not in ('s', 'c', 'ns', 'ms', 'air', 'nsec')]
         joined = ''.join(words)
         if joined in _KINDS:
@@ -256,7 +256,11 @@ def _first_kind(words: Sequence[str]) -> str:
 def _chosen_columns(
     table: TextTable, names: Sequence[str], option: str, found: Columns
 ) -> tuple[int, ...]:
-    """Indices of the columns that the user chose; () if this table does not have all of them."""
+    """Indices of the columns that the user chose; () if this table does not have all of them.
+
+    `names`: headers, with or without unit, case ignored, or numbers from 1. Notes the columns as
+    ``told`` in ``found.origin``. Raises InputError if one is named twice.
+    """
     columns = []
     index = {name.casefold(): i for i, name in enumerate(table.names)}
     for i, name in enumerate(table.names):
@@ -284,9 +288,11 @@ def _joint_columns(
     taken: set[int],
     found: Columns,
 ) -> tuple[int, ...]:
-    """Columns of the joints, base to tip.
+    """Columns of the joints, base to tip; () if none are found.
 
-    Columns of the previous joints go into `found.from_joints`.
+    Columns of the previous joints go into `found.from_joints`, of torques into `found.efforts`;
+    all are added to `taken` and `found`, in place. Reported angles are preferred to others, and
+    sets of as many columns as the robot has joints. Raises InputError if several sets are left.
     """
     complete: dict[tuple[str, ...], tuple[int, ...]] = {}
     schemes = [tuple(tuple(_Header.of(name).words) for name in joint_names)]
@@ -344,7 +350,10 @@ def _joint_columns(
 def _single_set(
     table: TextTable, sets: Sequence[tuple[int, ...]], what: str, remedy: str
 ) -> tuple[int, ...]:
-    """The only set of columns; () if there is none. Raises InputError if there are several."""
+    """The only set of columns; () if there is none. Raises InputError if there are several.
+
+    `what`, `remedy`: what the sets could be, and what to do, for the message.
+    """
     if len(sets) > 1:
         listed = '; '.join(', '.join(table.names[i] for i in columns) for columns in sets[:4])
         raise InputError(f'{table.path}: these could all be {what}: {listed}; {remedy}')
@@ -356,7 +365,8 @@ def _joint_number(
 ) -> tuple[int | None, tuple[str, ...]]:
     """Number of the joint, from 1, that a header names, and the other words.
 
-    None and () if it names no joint.
+    The name is replaced by '=', a mere number by '*'. None and () if it names no joint. `named`:
+    words of each joint's name.
     """
     for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
@@ -380,8 +390,8 @@ def _chosen_points(
 ) -> dict[str, tuple[int, ...]]:
     """Columns by marker of --points, by marker names or by three columns each.
 
-    Notes the origin of the columns in `found`; {} if this table does not have all of them.
-    Raises InputError if they do not come by threes.
+    Notes the origin of the columns in `found`; {} if this table does not have all of them. Raises
+    InputError if their number is no multiple of three.
     """
     groups = {name: table.groups[name] for name in table.groups} or {
         _marker_label(table, columns): columns for columns in _xyz_groups(headers, set()).values()
@@ -403,7 +413,10 @@ def _chosen_points(
 def _columns_by_marker(
     table: TextTable, sets: Sequence[tuple[int, ...]]
 ) -> dict[str, tuple[int, ...]]:
-    """Columns X, Y, Z by marker; the name of a single marker is ''."""
+    """Columns X, Y, Z by marker; the name of a single marker is ''.
+
+    Markers are named by their headers, or marker_1, marker_2, … if two of these are equal.
+    """
     if len(sets) < 2:
         return dict.fromkeys([''] * len(sets), sets[0]) if sets else {}
     labels = [_marker_label(table, columns) for columns in sets]
@@ -413,7 +426,10 @@ def _columns_by_marker(
 
 
 def _marker_label(table: TextTable, columns: Sequence[int]) -> str:
-    """Name of a marker: the header of its X column without the axis."""
+    """Name of a marker: the header of its X column without unit and axis.
+
+    'marker_' is put before a name that is empty or a number.
+    """
     name = split_unit(table.names[columns[0]])[0]
     stem = re.sub(r'(?<![^\W\d_])(?:[Pp]os(?:ition)?|[Pp])?[_ .-]?[xX](?![^\W\d_])', '', name)
     stem = stem.strip(' _-./:')
@@ -423,9 +439,10 @@ def _marker_label(table: TextTable, columns: Sequence[int]) -> str:
 def _xyz_groups(
     headers: Sequence[_Header], taken: set[int], fewest: int = 3
 ) -> dict[tuple[str, ...], tuple[int, ...]]:
-    """Columns X, Y and Z by the words around the axis.
+    """Columns X, Y and Z, in this order, by the words around the axis, '*' for the axis.
 
-    Groups with fewer than `fewest` of the three are left out.
+    Groups with fewer than `fewest` of the three are left out, as are columns in `taken` and those
+    with a unit that is no length.
     """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
@@ -446,7 +463,12 @@ def _xyz_groups(
 def _point_columns(
     table: TextTable, headers: Sequence[_Header], taken: set[int], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Columns X, Y, Z by marker; columns of standard deviations go into `found.stds`."""
+    """Columns X, Y, Z by marker; columns of standard deviations go into `found.stds`.
+
+    {} if there are none. Nominal positions, deviations and the robot's own tool are not taken if
+    there are others. Adds the columns to `taken` and `found`, in place. Raises InputError if
+    several could be the measured point, or an axis of it is missing.
+    """
     if table.groups:
         chosen = {name: table.groups[name] for name in table.points or table.groups}
         found.orientations = {name: table.turns[name] for name in chosen if name in table.turns}
@@ -488,7 +510,7 @@ def _point_columns(
 
 
 def _lettered_stems(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
-    """Word groups that differ only in one letter, which runs A, B and so on."""
+    """Word groups that differ only in one letter, which runs A, B and so on without a gap."""
     alike: dict[tuple[str, ...], dict[str, tuple[str, ...]]] = defaultdict(dict)
     for stem in stems:
         for i, word in enumerate(stem):
@@ -508,7 +530,12 @@ _NAME_POINTS = (
 
 
 def _find_orientation(headers: Sequence[_Header], taken: set[int], found: Columns) -> None:
-    """Find the columns of an orientation measured with the points of a single marker."""
+    """Find the columns of an orientation measured with the points of a single marker.
+
+    A quaternion with letters goes into `found.orientations`, three angles or a quaternion without
+    letters into `found.ambiguous_orientation`. Nothing is done with several markers, or if several
+    orientations are as likely.
+    """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i not in taken and header.unit in ('', *ANGLES):
@@ -585,7 +612,7 @@ def _orientation_component(words: tuple[str, ...]) -> tuple[tuple[str, ...], str
 
 
 def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
-    """Words with `px`, `posx`, `sy` or `dz` split into prefix and axis."""
+    """Words with `px`, `posx`, `sy` or `dz` split into prefix and axis, and easting as `x`."""
     words = [_AXIS_WORDS.get(word, word) for word in words if word not in _SURVEYED]
     split = (
         (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)
@@ -595,7 +622,7 @@ def _with_axis(words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _claim(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
-    """Mark columns as used, with their meaning known from the header."""
+    """Mark columns as used, with their meaning known from the header, in `taken` and `found`."""
     taken.update(columns)
     found.origin.update(dict.fromkeys(columns, 'header'))
 
@@ -603,8 +630,9 @@ def _claim(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
 def _columns_by_place(table: TextTable, found: Columns, joints: int) -> Columns:
     """Complete `found` (changed in place) by the place of columns without a header.
 
-    A name, joints, then X, Y, Z; or only the joints, or only X, Y, Z. Raises InputError if nothing
-    is found and the number of numeric columns fits none of these.
+    A name, joints, then X, Y, Z; or only the joints, or only X, Y, Z; row numbers may come first.
+    `joints`: number of the robot's joints. Raises InputError if nothing is found and the number of
+    numeric columns fits none of these.
     """
     if table.groups and not found.points:
         found.points, found.orientations = {**table.groups}, {**table.turns}
@@ -640,7 +668,10 @@ def _columns_by_place(table: TextTable, found: Columns, joints: int) -> Columns:
 
 
 def _counts_up(table: TextTable, numeric: Sequence[int]) -> bool:
-    """Whether the first numeric column holds different whole numbers, as row numbers do."""
+    """Whether the first numeric column holds different whole numbers, as row numbers do.
+
+    `numeric`: indices of the numeric columns; False if there are none.
+    """
     if not numeric:
         return False
     cells = [row[numeric[0]] for row in table.rows]
@@ -648,7 +679,7 @@ def _counts_up(table: TextTable, numeric: Sequence[int]) -> bool:
 
 
 def _is_numeric(table: TextTable, column: int) -> bool:
-    """Whether a column has numbers, and no other text than marks for missing values."""
+    """Whether a column has a number, and no other text than marks for missing values."""
     try:
         values = [table.number(row, column) for row in range(len(table.rows))]
     except InputError:

@@ -26,8 +26,8 @@ def is_frame(given: Any) -> bool:
 def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
     """Data frames as text tables; `names` are for messages.
 
-    The index becomes a column, unless it counts the rows of all frames from 0 on. Raises
-    InputError if an index is twice in frames to be joined.
+    The index becomes a column, ``time`` or ``index``, unless it counts the rows of all frames from
+    0 on. Raises InputError if an index is twice in frames to be joined.
     """
     plain = all(_counts(frame) for frame in frames)
     for frame, name in zip(frames, names):
@@ -44,7 +44,11 @@ def _counts(frame: Any) -> bool:
 
 
 def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
-    """Text table of a data frame, with its index as a column if `with_index`."""
+    """Text table of a data frame, with its index as a column if `with_index`.
+
+    Levels of column names are joined by a blank. Columns that are merely counted have no header.
+    Rows without a value are left out, with a note.
+    """
     header = [' '.join(map(str, c)) if isinstance(c, tuple) else str(c) for c in frame.columns]
     # A frame of an array has counted columns: no names.
     named = header != [*map(str, range(len(header)))]

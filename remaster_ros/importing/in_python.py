@@ -48,7 +48,13 @@ class Choices:
 def of_arrays(
     joints: Any, points: Any, robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Session from arrays of joints and points, row by row; see `session_from`."""
+    """Session from arrays of joints, (n, k), and points, (n, 3), row by row; see `session_from`.
+
+    In rad and m unless the options state units. Two data frames are joined as tables. Rows with
+    NaN are left out, with a warning in the log. Raises InputError for other shapes or numbers of
+    rows, infinite values, or joints beyond their limits, and InsufficientDataError if they do not
+    fit the robot.
+    """
     urdf, chain = robot
     if is_frame(joints) and is_frame(points):
         with _with_argument_names(choices.arguments):
@@ -83,7 +89,7 @@ def of_arrays(
 
 
 def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choices) -> Session:
-    """Session from files or data frames; see `import_table`."""
+    """Session from files or data frames; see `import_table`. Raises as `of_tables`."""
     frames = [file for file in files if is_frame(file)]
     names = ['frame'] if len(frames) == 1 else [f'frame {i + 1}' for i in range(len(frames))]
     with _with_argument_names(choices.arguments):
@@ -96,7 +102,11 @@ def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choi
 def of_tables(
     files: Sequence[Path | TextTable], robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Session from one table, or from a table of joints and one of points that are joined."""
+    """Session from one table, or from a table of joints and one of points that are joined.
+
+    Raises InputError for a table that cannot be read or understood or joints beyond their limits,
+    and InsufficientDataError if it does not fit the robot; both name arguments of the function.
+    """
     urdf, chain = robot
     with _with_argument_names(choices.arguments):
         rows = read_rows(files, chain, choices.table).in_order()
@@ -108,7 +118,10 @@ def of_tables(
 
 @contextlib.contextmanager
 def _with_argument_names(arguments: Collection[str]) -> Iterator[None]:
-    """Replace options of the command in errors by the arguments of the function."""
+    """Replace options of the command in errors by the arguments of the function.
+
+    Concerns InputError and InsufficientDataError; their type stays.
+    """
     try:
         yield
     except (InputError, InsufficientDataError) as error:
@@ -122,7 +135,11 @@ def _with_argument_names(arguments: Collection[str]) -> Iterator[None]:
 def _checked_session(
     rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes: str
 ) -> Session:
-    """Session of rows that fit the robot. Raises InsufficientDataError, with a remedy, if not."""
+    """Session of rows that fit the robot; warnings are logged.
+
+    Whole turns are taken off. Raises InsufficientDataError, with a remedy, if the rows do not fit,
+    and InputError if joints are beyond their limits.
+    """
     with _with_argument_names(choices.arguments):
         options, _ = with_controller_coupling(rows, chain, choices.corrections)
         rng = np.random.default_rng(choices.seed)
@@ -140,7 +157,11 @@ def _checked_session(
 
 
 def _number_array(given: Any, what: str, names: Sequence[str]) -> FloatArray:
-    """Array (n, len(names)) of an array, or of the named columns of a data frame or dict."""
+    """Array (n, len(names)) of an array, or of the named columns of a data frame or dict.
+
+    NaN is kept. Raises InputError for a missing column, text, another shape or infinite values;
+    `what`: name in the message.
+    """
     columns = getattr(given, 'columns', None)
     if columns is None and isinstance(given, dict):
         columns = given.keys()

@@ -48,7 +48,9 @@ class JointMotion:
     def of(cls, joints: Stream, where: str) -> JointMotion:
         """Splines of joint states, rad; ``where``: for messages.
 
-        Raises InputError if the reports are too rare, or no stretch is long enough.
+        A gap of over 0.1 s and over five usual steps ends a stretch; stretches of under 0.5 s are
+        left out. Raises InputError if the median rate is below 40 Hz (`LEAST_RATE_HZ`), or no
+        stretch is long enough.
         """
         stamps, values = _increasing(joints)
         if len(stamps) < 2:
@@ -88,13 +90,16 @@ class JointMotion:
         )
 
     def stretch(self, times: FloatArray) -> FloatArray:
-        """Index of the stretch of each time, (n,); -1 outside all."""
+        """Index of the stretch of each time, s, (n,), from 0; -1 outside all."""
         index = np.searchsorted(self.begin, times, side='right') - 1
         inside = (index >= 0) & (times <= self.end[np.maximum(index, 0)])
         return np.where(inside, index, -1)
 
     def at(self, times: FloatArray, derivative: int = 0) -> FloatArray:
-        """Joint positions, or their derivatives by time, (n, k); NaN outside all stretches."""
+        """Joint positions, rad, at times, s, (n, k); NaN outside all stretches.
+
+        `derivative` 1 and 2: velocities and accelerations, rad/s and rad/s².
+        """
         stretch = self.stretch(times)
         result = np.full((len(times), len(self.noise)), np.nan)
         for index, splines in enumerate(self.splines):
@@ -107,7 +112,7 @@ class JointMotion:
 
 
 def _increasing(joints: Stream) -> tuple[FloatArray, FloatArray]:
-    """Reports with increasing stamps: of equal stamps the first."""
+    """Stamps and values of reports with increasing stamps: of those within 1 µs the first."""
     kept: BoolArray = np.diff(joints.stamps, prepend=-np.inf) > 1e-6
     return joints.stamps[kept], joints.values[kept]
 

@@ -130,7 +130,10 @@ class _Frames:
         )
 
     def at_constant_rate(self) -> _Frames | None:
-        """Frames with stamps at a constant rate; None if they do not come at one."""
+        """Frames with stamps at a constant rate; None if they do not come at one.
+
+        They do if 99 % of the stamps are within half a period of it and no two are in one period.
+        """
         stamps = self.stamps
         gaps = np.diff(stamps)
         period = float(np.median(gaps)) if len(gaps) else 0.0
@@ -196,7 +199,13 @@ class _Recording:
         self.dropped = 0
 
     def blocks(self, sensor: int, clock_s: float, guess: _Guess | None) -> _Block:
-        """Rows of a sensor whose stamps are shifted by an offset, s."""
+        """Rows of a sensor, of `BLOCK_S` each, with its stamps shifted by an offset, s.
+
+        ``sensor``: its index; ``guess``: None to take the plain means of the frames. Blocks with
+        under half of the usual frames, or in which all joints are slower than `STILL_RAD_S`, are
+        left out. With a guess, frames far from their row (`GROSS` times the median) are counted in
+        ``dropped``.
+        """
         frames, motion = self.frames[list(self.frames)[sensor]], self.motion
         times = frames.stamps + clock_s
         inside = motion.stretch(times) >= 0
@@ -242,9 +251,10 @@ class _Recording:
         )
 
     def fitted(self, clocks_s: FloatArray, found: bool) -> tuple[FloatArray, _Guess, float]:
-        """Clock offsets, s, robust fit and the median error that it leaves, m.
+        """Clock offsets, s, (sensors,), robust fit and the median error that it leaves, m.
 
-        ``clocks_s``: offsets to begin with; ``found``: whether they are to be found.
+        ``clocks_s``: offsets to begin with; ``found``: whether they are to be found, in up to 12
+        steps until all are below 20 µs. Raises InputError as `session`.
         """
         guess: _Guess | None = None
         error_m = np.inf
@@ -269,7 +279,8 @@ class _Recording:
     ) -> Session:
         """Session with the sensors' stamps shifted by offsets, s, (sensors,).
 
-        ``rng``: draws the held-out segments; None for none.
+        ``rng``: draws the held-out segments; None for none. ``guess``: as in `blocks`. Raises
+        InputError if a sensor saw the arm move in fewer than 60 rows.
         """
         self.dropped = 0
         names = list(self.frames)
@@ -469,12 +480,15 @@ def _rate_hz(stream: Stream) -> float:
 
 
 def _late(seconds: float) -> str:
-    """Delay of stamps in words."""
+    """Delay of stamps, s, in words: '1.25 ms late', or 'early' if it is negative."""
     return f'{1e3 * abs(seconds):.2f} ms {"late" if seconds >= 0.0 else "early"}'
 
 
 def _segments(number: IntArray) -> IntArray:
-    """Segment of each block, by the rising numbers of the blocks (b,)."""
+    """Segment of each block, (b,), from 0, by the rising numbers of the blocks (b,).
+
+    A gap in the numbers ends a segment; others have about five blocks.
+    """
     runs = np.split(np.arange(len(number)), np.flatnonzero(np.diff(number) > 1) + 1)
     segment, count = np.zeros(len(number), np.int64), 0
     for run in runs:
@@ -506,7 +520,7 @@ def _means(
 
 
 def _joined(parts: Sequence[Measurements]) -> Measurements:
-    """Rows of all sensors in the order of time, numbered."""
+    """Rows of all sensors in the order of time, sensor and marker, numbered from 0."""
     columns = {
         name: None
         if getattr(parts[0], name) is None
@@ -527,7 +541,8 @@ def _clock_by_speeds(
 ) -> float:
     """Offset of the clocks with the largest correlation of speeds of marker and tool, s.
 
-    0 if all are small.
+    To be added to the sensor's stamps; sought within 3 s in steps of 5 ms, by the first marker. 0
+    if no correlation is above 0.5, or the marker is in fewer than 60 frames.
     """
     grid = np.arange(motion.begin[0], motion.end[-1], SPEED_STEP_S)
     name = markers[frames.markers[0]]
@@ -563,7 +578,11 @@ def _clock_by_speeds(
 
 
 def _robust_fit(session: Session) -> tuple[_Guess, FloatArray, float]:
-    """Robust fit of a session, the remaining offset of each sensor's clock, s, and the error."""
+    """Robust fit of a session, the remaining offset of each sensor's clock, s, and the error.
+
+    The offset, (sensors,), is still to be added to the stamps; the error is the median distance,
+    m.
+    """
     problem = Problem.of(session)
     measurements, rows = problem.measurements, problem.fitted
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_FITTED)).astype(np.int64)]

@@ -25,7 +25,8 @@ _COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
 def with_poses(table: TextTable) -> TextTable:
     """Table with X, Y, Z and quaternion in place of the sixteen columns of each 4×4 matrix.
 
-    Sixteen columns that are no rigid motion stay as they are.
+    The seven columns, named ``pose x`` to ``pose qw`` by the matrix's name, are in `groups` and
+    `turns` of the table. Sixteen columns that are no rigid motion in any row stay as they are.
     """
     names, rows = list(table.names), [list(row) for row in table.rows]
     dropped: set[int] = set()
@@ -61,7 +62,10 @@ def with_poses(table: TextTable) -> TextTable:
 
 
 def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
-    """Sixteen columns of each matrix, row by row or as counted, by the matrix's name."""
+    """Sixteen columns of each matrix, row by row or as counted, by the matrix's name.
+
+    Indices and counts in headers begin with 0 or 1. {} if there are none.
+    """
     found: dict[str, list[int]] = {}
     for pattern, counts in ((_ROW_AND_COLUMN, SIZE), (_COUNTED, COUNT)):
         by_stem: dict[str, dict[tuple[int, ...], int]] = defaultdict(dict)
@@ -80,7 +84,10 @@ def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
 
 
 def _matrices_by_place(table: TextTable) -> Mapping[str, list[int]]:
-    """Sixteen adjacent columns of each matrix in a table without names, by a number."""
+    """Sixteen adjacent columns of each rigid motion in a table without names.
+
+    By ``pose``, or ``pose 1``, ``pose 2``, …; {} if there are none.
+    """
     found: dict[str, list[int]] = {}
     first = 0
     while first + COUNT <= len(table.names):

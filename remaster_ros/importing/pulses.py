@@ -22,12 +22,14 @@ _UNIT = re.compile(rf'\s*[\[(]?\b(?:{"|".join(PULSES)})\b[\])]?\s*$', re.IGNOREC
 def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tuple[Table, str]:
     """Table of joints in degrees, and a sentence on the conversion ('' if they are no pulses).
 
-    `per_degree` are the pulses of a degree for each joint, base to tip; () if not given.
+    `per_degree`: pulses of a degree for each joint, base to tip; () if not given. `angles`: unit
+    that the user stated, '' if none. The headers of converted columns end in ``[deg]``.
 
     Raises
     ------
     InputError
-        The joints are in pulses, and `per_degree` is not given.
+        The joints are in pulses and `per_degree` is not given, or its number is not that of the
+        joints.
     """
     table, columns = joints
     headers = [table.names[i] for i in columns.joints]
@@ -69,7 +71,10 @@ def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tup
 
 
 def _look_like_pulses(table: TextTable, columns: Columns, angles: str) -> bool:
-    """Whether joints without a unit are whole numbers too large for angles."""
+    """Whether joints without a unit are all whole numbers, with one above 3600 (ten turns).
+
+    `angles`: as in `in_degrees`.
+    """
     if angles or any(columns.units.get(i) for i in columns.joints):
         return False
     values = numbers(table, columns.joints, optional=True)

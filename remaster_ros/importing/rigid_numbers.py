@@ -14,9 +14,10 @@ _ROUNDING = 2e-3
 
 
 def rigid(numbers: FloatArray) -> FloatArray | None:
-    """Rigid motions (n, 4, 4) from sixteen numbers each, (n, 16); None if they are none.
+    """Rigid motions (n, 4, 4) from sixteen numbers each, (n, 16); None if any is none.
 
-    The place of the row 0 0 0 1 decides between rows and columns, which libfranka writes.
+    The place of the row 0 0 0 1 decides between rows and columns, which libfranka writes. The
+    product of a rotation matrix and its transpose may be 2e-3 off the identity.
     """
     T = numbers.reshape(-1, SIZE, SIZE)
     for each in (T, T.swapaxes(1, 2)):

@@ -81,9 +81,11 @@ def join(
     how: JoinCriterion = '',
     within_s: float = 1.0,
 ) -> Pairs:
-    """Pair the rows of two tables by name, time or order.
+    """Pair the rows of two tables by name, time or order, or by the first of these that works.
 
-    Raises InputError if nothing pairs them.
+    By order unasked only for data frames whose rows were counted alike. `within_s`: largest
+    difference of times, s. Raises InputError if nothing pairs them, a name is twice, no times are
+    near, every point was measured in motion, or the numbers of rows differ for ``order``.
     """
     if how in ('', 'name'):
         pairs = _pairs_by_name(points, joints, by_header=how == '')
@@ -124,11 +126,12 @@ def common_names(
 ) -> tuple[int, int, list[str], list[str]] | None:
     """The pair of columns whose names match in most rows, and the names in comparable form.
 
-    Names are compared at rising levels until some match: `P01`, `p1` and `P1 ` are equal; then the
-    last parts (`A::KR6::P1` and `P1`), then names without brackets and underscores (`P[1]`), then
-    without the beginning and end that all names of a table share (`KR6_P1` and `Pose 1`), then the
-    last words (`KR6_P1` and `P1`). At the last two levels one table must contain all names of the
-    other. If not `by_header`, any unused column may hold the names. None if no level matches.
+    Result: index in points, in joints (from 0), names in points, in joints. Names are compared at
+    rising levels until some match: `P01`, `p1` and `P1 ` are equal; then the last parts
+    (`A::KR6::P1` and `P1`), then names without brackets and underscores (`P[1]`), then without the
+    beginning and end that all names of a table share (`KR6_P1` and `Pose 1`), then the last words
+    (`KR6_P1` and `P1`). At the last two levels one table must contain all names of the other, at
+    least four. If not `by_header`, any unused column may hold the names. None if no level matches.
     """
     named = [(i, j) for i in points[1].others['name'] for j in joints[1].others['name']]
     for level in range(_LAST_WORD + 1):
@@ -148,7 +151,10 @@ def common_names(
 
 
 def _possible_name_columns(table: TextTable, columns: Columns) -> list[int]:
-    """Return columns that may be names: of no other use, no two rows alike."""
+    """Indices of columns that may be names: of no other use, no two rows alike.
+
+    None of the cells is empty or a number with a decimal sign.
+    """
     used = {*columns.joints, *columns.from_joints, *columns.point}
     used |= {
         i
@@ -170,8 +176,9 @@ def _best_name_columns(
 ) -> tuple[int, int, list[str], list[str]] | None:
     """The pair of columns with most names in common at one level of `_comparison_keys`.
 
-    If not `sure` (the header does not call them names), one table must contain all names of the
-    other. None if no pair matches.
+    As in `common_names`; `columns`: the pairs to compare. If not `sure` (the header does not call
+    them names), one table must contain all names of the other, at least four. None if no pair
+    matches.
     """
     best: tuple[int, int, int, list[str], list[str]] | None = None
     for i, j in columns:
@@ -191,7 +198,8 @@ def _best_name_columns(
 def _pairs_by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
     """Pairs of rows with equal names; None if the tables share none.
 
-    Raises InputError if a name is twice.
+    Rows whose name is not in the other table are left out, with a sentence. Raises InputError if a
+    common name is twice, in points only if these have neither sensors nor markers.
     """
     best = common_names(points, joints, by_header)
     if best is None:
@@ -254,16 +262,19 @@ def _comparison_keys(table: TextTable, column: int, level: int) -> list[str]:
 
 
 def _common_prefix_length(names: Sequence[str]) -> int:
-    """Number of letters with which all names begin, not counting trailing digits."""
+    """Number of letters with which all names begin, digits at its end not counted."""
     first, last = min(names), max(names)
     same = itertools.takewhile(lambda pair: pair[0] == pair[1], zip(first, last))
     return len(''.join(letter for letter, _ in same).rstrip(string.digits))
 
 
 def _pairs_by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
-    """Pairs of each point with the joints reported nearest in time.
+    """Pairs of each point with the joints reported nearest in time, `within_s` at most.
 
-    None if a table has no times.
+    None if a table has no times. Times of day without a date are moved by whole days. A point
+    between two reports that differ by over 0.05 degrees in a joint was measured in motion and is
+    left out. Raises InputError if no point is near, all were in motion, or rows of joints share a
+    time.
     """
     when, reported = times(*points), times(*joints)
     if when is None or reported is None:
@@ -410,7 +421,10 @@ class RawRows:
     effort: FloatArray | None = None  # Measured torques, N m, (n, k); None if not measured
 
     def in_order(self) -> RawRows:
-        """Rows sorted by their times, with a warning if that changed the order."""
+        """Rows sorted by their times, with a warning unless these rise already.
+
+        Unchanged without times, too.
+        """
         if self.stamp_s is None:
             return self
         order = np.argsort(self.stamp_s, kind='stable')
@@ -433,12 +447,17 @@ class RawRows:
 def read_rows(
     files: Sequence[Path | TextTable], chain: SerialChain, options: TableOptions
 ) -> RawRows:
-    """Read one table with joints and points, or one table of each, from files or tables in memory.
+    """Rows of one table with joints and points, or of one table of each, in SI.
+
+    Read from files or tables in memory, at most two, and joined; of streams the means at
+    standstills are taken. A .dat and a .src file of one name are one table of a KUKA controller.
 
     Raises
     ------
     InputError
-        One line naming file, line, column and remedy.
+        One line naming file, line, column and remedy: more files, unclear or missing columns,
+        another number of joints than the robot's, cells that are no numbers, or rows that cannot
+        be joined.
     """
     read_before = [file for file in files if isinstance(file, TextTable)]
     paths = [file for file in files if isinstance(file, Path)]
@@ -580,7 +599,9 @@ def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
 def _without_incomplete_rows(points: Table, joints: Table) -> tuple[Table, Table, tuple[str, ...]]:
     """Points and joints without rows that lack joints or a point.
 
-    Last result: a sentence on what is left out.
+    A row lacks them if all their cells are missing; in data frames if any is, unless the columns
+    are more than the joints. If all rows do, none is left out. Last result: sentences on what is
+    left out.
     """
     same = points[0] is joints[0]
     kept, notes = {}, []
@@ -608,7 +629,11 @@ def _without_incomplete_rows(points: Table, joints: Table) -> tuple[Table, Table
 
 
 def _in_move_order(data: TextTable, program: Path) -> TextTable:
-    """Positions of a KUKA data file (.dat) in the order of the moves of its program (.src)."""
+    """Positions of a KUKA data file (.dat) in the order of the moves of its program (.src).
+
+    As often as there are moves; positions without a move are dropped. If no move names one, the
+    order stays, with a note.
+    """
     text, _ = decode(read_limited(program, TABLE_LIMIT, 'name the program'), program, '')
     named = [row[0] for row in data.rows] if data.names[0] == 'name' else []
     order = kuka.moves(text)
@@ -631,7 +656,12 @@ def _raw_rows(
     description: tuple[str, ...],
     warnings: tuple[str, ...],
 ) -> RawRows:
-    """Rows in SI from a table of points and a table of joints that belong together row by row."""
+    """Rows in SI from a table of points and a table of joints that belong together row by row.
+
+    One for each marker seen in a row. `stamp`: times by another clock, s, (n,); None to take the
+    table's. Raises InputError for missing or faulty numbers, units that do not fit, or points
+    beyond 200 m.
+    """
     table, columns = points
     q, units, scale = joint_values(*joints, chain, options.angles)
     angle = next((unit for unit, _ in units if unit in ANGLES), None)
@@ -752,7 +782,10 @@ def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray)
 def _refuse_non_unit_quaternions(
     table: TextTable, columns: Sequence[int], turns: FloatArray
 ) -> None:
-    """Raise InputError for the first quaternion, (n, 4), whose length is not 1."""
+    """Raise InputError for the first quaternion, (n, 4), whose length differs from 1 by over 1e-3.
+
+    NaN is allowed. `columns`: indices of the four columns.
+    """
     off = np.abs(np.linalg.norm(turns, axis=1) - 1.0) > LENGTH_TOLERANCE
     for row in np.flatnonzero(off)[:1]:
         raise table.fault(
@@ -764,7 +797,10 @@ def _refuse_non_unit_quaternions(
 
 
 def moving_markers(raw: FloatArray) -> BoolArray:
-    """Mask of the markers in (markers, n, 3), NaN for missing readings, that move with the arm."""
+    """Mask of the markers in (markers, n, 3), NaN for missing readings, that move with the arm.
+
+    A marker does if its extent along an axis is over 2 % (`STATIC`) of the largest one's.
+    """
     seen = np.isfinite(raw[:, :, 0])
     extent = np.array(
         [
@@ -778,9 +814,9 @@ def moving_markers(raw: FloatArray) -> BoolArray:
 def _markers_on_arm(
     raw: FloatArray, names: Sequence[str], table: TextTable
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Mask of the markers that move with the arm, (markers,).
+    """Mask of the markers that move with the arm, (markers,), as `moving_markers`.
 
-    Last result: a sentence on each other marker.
+    Last result: a sentence on each other marker, whether unmoved or never seen.
     """
     moved = moving_markers(raw)
     return moved, tuple(
@@ -793,7 +829,10 @@ def _markers_on_arm(
 
 
 def _shared_time_note(stamp: FloatArray, q: FloatArray) -> str:
-    """Sentence that most configurations share one time, which is unusable then; '' if not."""
+    """Sentence that over half of the configurations share one time, which is unusable then.
+
+    '' if not, or for fewer than four configurations.
+    """
     configurations = np.unique(np.column_stack((q, stamp)), axis=0)
     if len(configurations) < _FEWEST_ALIKE:
         return ''
@@ -817,9 +856,10 @@ def _optional_column(points: Table, kind: str) -> FloatArray:
 def _column_meanings(
     columns: Columns, chain: SerialChain, units: Sequence[str], length: str
 ) -> dict[int, str]:
-    """Meaning of each column in words, by column index.
+    """Meaning of each column in words, by column index from 0; unused columns are left out.
 
-    Columns of points only if `length` is given.
+    `units`: text on the unit of each joint; columns of points only if `length`, their unit, is
+    given.
     """
 
     def how(i: int) -> str:
@@ -865,7 +905,10 @@ def _choice_for_table(
 
 
 def _choice_for_file(chosen: ColumnChoice, path: Path, paths: Sequence[Path]) -> ColumnChoice:
-    """Chosen columns that concern one file: `joints.txt:1-6` is for that file alone."""
+    """Chosen columns that concern one file: `joints.txt:1-6` is for that file alone.
+
+    Ranges are expanded to their numbers. `paths`: all files.
+    """
     of_file: dict[str, tuple[str, ...]] = {}
     for kind, names in (('joints', chosen.joints), ('points', chosen.points)):
         for other in paths:
@@ -878,7 +921,10 @@ def _choice_for_file(chosen: ColumnChoice, path: Path, paths: Sequence[Path]) ->
 
 
 def _expanded_range(name: str) -> list[str]:
-    """Column numbers of a range such as `1-6`; the name itself if it is no range."""
+    """Column numbers of a range such as `1-6`; the name itself if it is no range.
+
+    A falling range, or one beyond 5000 columns, is none.
+    """
     ends = re.fullmatch(r'(\d+)-(\d+)', name)
     if ends is None or not int(ends[1]) <= int(ends[2]) <= MOST_COLUMNS:
         return [name]
@@ -886,7 +932,10 @@ def _expanded_range(name: str) -> list[str]:
 
 
 def _prefer_chosen(found: list[Table], kind: str) -> list[Table]:
-    """Tables in which the user chose columns of a kind; all tables if none were chosen."""
+    """Tables in which the user chose columns of a kind; all tables if none were chosen.
+
+    `kind`: ``joints``, or anything else for points.
+    """
     chosen = [
         pair
         for pair in found
@@ -899,7 +948,10 @@ def _prefer_chosen(found: list[Table], kind: str) -> list[Table]:
 def _single_table(
     found: list[Table], tables: Sequence[TextTable], what: str, option: str
 ) -> Table:
-    """The only table of a list. Raises InputError if the list has none or several."""
+    """The only table of a list. Raises InputError if the list has none or several.
+
+    `what`, `option`: what is looked for and the option that names it, for the message.
+    """
     if len(found) == 1:
         return found[0]
     names = ' and '.join(str(table.path) for table in tables)
@@ -913,7 +965,7 @@ def _single_table(
 
 
 def _refuse_absent_columns(found: list[Table], chosen: ColumnChoice) -> None:
-    """Raise InputError if a column that the user chose is in no table."""
+    """Raise InputError if a column that the user chose is in no table; ``none`` is no column."""
     for option, names, attribute in (
         ('--joints', chosen.joints, 'joints'),
         ('--points', chosen.points, 'point'),
@@ -934,7 +986,9 @@ def _refuse_absent_columns(found: list[Table], chosen: ColumnChoice) -> None:
 
 
 def from_tool(rows: RawRows) -> RawRows:
-    """Rows of a sensor on the tool, converted to the frame of the target that it sees.
+    """Rows of a sensor on the tool, with the pose of the sensor in the frame of its target.
+
+    Inverse of the measured pose of the target in the sensor's frame.
 
     Raises
     ------

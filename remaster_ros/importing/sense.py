@@ -71,6 +71,10 @@ def check_sense(
 ) -> Sense:
     """Fit the table to the robot and, if the error is gross, look for the mistake in it.
 
+    A table fits if its errors are within 5 mm and zero-offsets within 5 degrees, not over a tenth
+    of a sensor's rows are off, and markers are within 5 mm or 5.5 of their stated standard
+    deviations. Nothing is raised for too few data: such a table does not fit.
+
     Parameters
     ----------
     session
@@ -153,9 +157,10 @@ def check_sense(
 
 
 def _is_computed_from_joints(session: Session, chain: SerialChain) -> bool:
-    """Whether the points are computed from the joints by the nominal arm, in its base frame.
+    """Whether the points of all markers are computed from the joints by the nominal arm.
 
-    No sensor measures an arm to `COMPUTED_M`, and none knows the base frame that well.
+    The median distance from it, in its base frame, is below 20 µm: no sensor measures an arm to
+    `COMPUTED_M`, and none knows the base frame that well.
     """
     m = session.measurements
     for marker in range(len(session.markers)):
@@ -180,7 +185,11 @@ def _largest_offsets_text(offsets: FloatArray, chain: SerialChain) -> str:
 
 
 def _too_few(session: Session, joints: int) -> str:
-    """Sentence that the configurations are fewer than the unknowns need; '' if they are enough."""
+    """Sentence that the configurations are fewer than the unknowns need; '' if they are enough.
+
+    Unknowns: zero-offsets of all but the outer two of the `joints`, 6 of each sensor, 3 of each
+    marker. Held-out rows do not count, nor do configurations within 1 mrad of another.
+    """
     m = session.measurements.select(~session.measurements.is_validation)
     sensors, markers = len(np.unique(m.sensor)), len(np.unique(m.marker))
     # A configuration that is measured again tells of the noise alone.
@@ -205,7 +214,10 @@ def _too_few(session: Session, joints: int) -> str:
 
 
 def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sense | None:
-    """Finding that some markers fit when each is taken by itself; None if no marker fits."""
+    """Finding that some markers fit when each is taken by itself; None if no marker fits.
+
+    `error_text`: error of the fit of all, for the sentence.
+    """
     m = session.measurements
     fitting: dict[str, float] = {}
     for i, name in enumerate(session.markers):
@@ -234,7 +246,11 @@ def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sen
 
 
 def _outlying_rows(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
-    """Rows of the table that do not fit, with their distances, m, the farthest first."""
+    """Rows of the table that do not fit, with their distances, m, the farthest first.
+
+    Rows that are certainly gross and over 10 mm (`BENT_M`) from the fit. A row is named by file
+    and line.
+    """
     found = np.flatnonzero(off.off & (off.error_m > BENT_M))
     order = found[np.argsort(-off.error_m[found], kind='stable')]
     # Rows were left out where points were moved to other joints.
@@ -250,7 +266,7 @@ def _outlier_warning(outlying: Sequence[tuple[str, float]], rows: RawRows) -> st
 
 
 def _outliers_text(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
-    """Number of rows that do not fit, their distances, and the first of them, as text."""
+    """Number of rows that do not fit, their distances, and the first five of them, as text."""
     shown = [
         f'{where.rpartition("/")[2]} ({shown_mm(error)})' for where, error in outlying[:SHOWN_ROWS]
     ]
@@ -285,7 +301,10 @@ ON_TOOL = '; poses that a camera on the tool has of a board that stands need --o
 
 
 def _unmastered(given: Fitted, error_text: str, chain: SerialChain, never_mastered: bool) -> Sense:
-    """Finding that zero-offsets are larger than those of a mastered robot, with the remedy."""
+    """Finding that zero-offsets are larger than those of a mastered robot, with the remedy.
+
+    Joints off by over 5 degrees (`LARGEST_OFFSET`) are named. The table fits if `never_mastered`.
+    """
     far = np.flatnonzero(np.abs(given.joint_offsets) > LARGEST_OFFSET * given.per_radian)
     listed = ' and '.join(
         f'{chain.joint_names[i]} off by {chain.shown_offset(i, given.joint_offsets[i], 1)}'

@@ -50,13 +50,15 @@ def arrangement_of(
     order
         Joint whose column each joint, base to tip, takes; () for no change.
     couple, reverse, add_deg
-        Corrections of joints as in `assemble.SessionOptions`.
+        Corrections of joints as in `assemble.SessionOptions`; only joint 3 can be coupled, to
+        joint 2, and angles are multiples of 90 degrees.
     angle_scale, length_scale
         Factors of the angles and of the points.
     mirrored
         Whether X and Y of the points are exchanged.
     shift, exchange
-        Rows by which each point is moved on, and two markers whose labels are exchanged.
+        Rows by which each point is moved on ('1' or '-1'), and two markers whose labels are
+        exchanged ('a,b'); one of the two at a time.
     turn
         Axis, and degrees by which the markers are turned about it; '' for no turn.
     tip_link
@@ -65,7 +67,8 @@ def arrangement_of(
     Raises
     ------
     InputError
-        Names that the session does not have, or angles that are no multiple of 90 degrees.
+        Names or observations that the session does not have, angles that are no multiple of 90
+        degrees, or corrections that exclude each other.
     """
     k = len(joint_names)
     if order and len(order) != k:
@@ -108,7 +111,10 @@ def arrangement_of(
 
 
 def corrected_session(session: Session, arrangement: Arrangement) -> Session:
-    """Session with a correction applied to all its rows, reference visits included."""
+    """Session with a correction applied to all its rows, reference visits included.
+
+    The session itself if the arrangement changes nothing. Raises InputError as `_controller`.
+    """
     if arrangement == Arrangement.given(len(arrangement.order)):
         return session
     whole = arranged(replace(session, measurements=all_rows(session)), arrangement)
@@ -175,7 +181,10 @@ def _row_shift(text: str) -> int:
 
 
 def _marker_pair(text: str, session: Session) -> tuple[int, ...]:
-    """Indices of two markers of a text such as ``sir,smr``."""
+    """Indices, from 0, of two markers of a text such as ``sir,smr``.
+
+    Raises InputError for another number of names or an unknown one.
+    """
     names = text.split(',')
     if len(names) != 2:
         raise InputError(f'--exchange-markers: {text!r} is not two markers, such as sir,smr')
@@ -183,7 +192,7 @@ def _marker_pair(text: str, session: Session) -> tuple[int, ...]:
 
 
 def _index(name: str, names: Sequence[str], option: str) -> int:
-    """Index of a name. Raises InputError, with the option, if it is unknown."""
+    """Index of a name, from 0. Raises InputError, with the option, if it is unknown."""
     if name not in names:
         raise InputError(
             f'{option}: there is no {name!r}; there are {", ".join(names)}'
@@ -193,7 +202,10 @@ def _index(name: str, names: Sequence[str], option: str) -> int:
 
 
 def _quarters(angle: float, option: str) -> int:
-    """Number of quarter turns in an angle, degrees. Raises InputError if it is no multiple."""
+    """Number of quarter turns in an angle, degrees, with sign.
+
+    Raises InputError, with the option, if the angle is no multiple of 90.
+    """
     quarters = angle / QUARTER_DEG
     if not np.isclose(quarters, round(quarters)):
         raise InputError(

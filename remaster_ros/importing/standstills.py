@@ -77,7 +77,7 @@ class Stream:
 
     @classmethod
     def of(cls, stamps: FloatArray, values: FloatArray) -> Stream:
-        """Stream of the finite values in the order of their stamps."""
+        """Stream of the rows that are finite, in the order of their stamps, s."""
         finite = np.flatnonzero(np.isfinite(values).all(axis=1) & np.isfinite(stamps))
         order = finite[np.argsort(stamps[finite], kind='stable')]
         return cls(stamps[order], values[order])
@@ -103,18 +103,25 @@ class Standstills:
 
     @property
     def shots(self) -> bool:
-        """Whether all are single measurements at one moment."""
+        """Whether all are single measurements at one moment; True if there are none."""
         return bool(np.all(self.begin == self.end))
 
     @classmethod
     def of_shots(cls, stamps: FloatArray, values: FloatArray) -> Standstills:
-        """Single measurements of an instrument, each taken while the arm stood still."""
+        """Single measurements of an instrument, each taken while the arm stood still.
+
+        `stamps`: s, (n,); `values`: (n, m). Motion before and after counts as unseen.
+        """
         none = np.zeros(len(stamps), bool)
         return cls(stamps, stamps, values, none, none)
 
 
 def is_stream(stamps: FloatArray) -> bool:
-    """Whether rows follow each other faster than an arm can stop and be measured."""
+    """Whether rows follow each other faster than an arm can stop and be measured.
+
+    The median step is below 1 s and not 0; False for three rows or fewer. `stamps`: s, in any
+    order.
+    """
     if len(stamps) <= _FEWEST_ROWS:
         return False
     # Times that are all the same are none.
@@ -122,9 +129,10 @@ def is_stream(stamps: FloatArray) -> bool:
 
 
 def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
-    """Standstills of joints, rad, that are longer than the arm may swing.
+    """Standstills of joints, rad, that are longer than the arm may swing, 0.5 s.
 
-    Each has at least `fewest` reports.
+    Each has at least `fewest` reports, which span up to 0.2 mrad in each joint, or ten standard
+    deviations of the noise if that is more, and never over 1 mrad.
     """
     rules = SettleRules()
     noise = min(_RANGE_STDS * _quietest(stream), 5.0 * rules.still_tolerance)
@@ -132,7 +140,12 @@ def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
 
 
 def point_standstills(stream: Stream) -> Standstills:
-    """Standstills of a marker, in any unit; empty if it never stood still."""
+    """Standstills of a marker, in any unit; empty if it never stood still.
+
+    Longer than 0.5 s, of three values or more that span up to ten standard deviations of the
+    quietest tenth, or 1e-4 of the extent. If that is over 1 % of the extent, the marker never
+    stood still.
+    """
     # A frame that jumps is no motion.
     values = _median_of_five(stream.values)
     smooth = Stream(stream.stamps, values)
@@ -144,7 +157,10 @@ def point_standstills(stream: Stream) -> Standstills:
 
 
 def _median_of_five(values: FloatArray) -> FloatArray:
-    """Running median over five values, (n, m)."""
+    """Running median over five values, (n, m), with the ends repeated.
+
+    Fewer than five values stay as they are.
+    """
     if len(values) < FEWEST_SAMPLES:
         return values
     padded = np.pad(values, ((2, 2), (0, 0)), mode='edge')
@@ -153,7 +169,10 @@ def _median_of_five(values: FloatArray) -> FloatArray:
 
 
 def _quietest(stream: Stream) -> float:
-    """Standard deviation in the quietest part of a stream, of its noisiest column."""
+    """Standard deviation in the quietest part of a stream, of its noisiest column.
+
+    The 10 % quantile over blocks of 0.5 s, of at least five values; 0 if there is no whole block.
+    """
     step = float(np.median(np.diff(stream.stamps))) if len(stream.stamps) > 1 else SWING_S
     size = max(FEWEST_SAMPLES, round(SWING_S / max(step, 1e-4)))
     blocks = len(stream.values) // size
@@ -166,7 +185,8 @@ def _quietest(stream: Stream) -> float:
 def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
     """Runs, longer than `SWING_S`, of at least `fewest` values that span `tolerance` or less.
 
-    A gap between stamps ends a run.
+    The span is that of each column. A gap between stamps, over 0.5 s and over three usual steps,
+    ends a run.
     """
     stamps, values = stream.stamps, stream.values
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
@@ -213,7 +233,7 @@ class Matching:
     def in_words(self, points: Standstills, joints: Standstills, names: tuple[str, str]) -> str:
         """Sentence on the number of pairs and the clock offset.
 
-        `names` are those of points and joints.
+        `points`, `joints`: all standstills; `names` are those of points and joints.
         """
         what = 'points' if points.shots else 'standstills'
         text = (
@@ -230,7 +250,10 @@ class Matching:
 
 
 def point_visits(stream: Stream) -> Standstills:
-    """Standstills of a stream of points, or the single measurements of an instrument."""
+    """Standstills of a stream of points, or the single measurements of an instrument.
+
+    Which of the two is decided by `is_stream`.
+    """
     if is_stream(stream.stamps):
         return point_standstills(stream)
     return Standstills.of_shots(stream.stamps, stream.values)
@@ -245,9 +268,10 @@ def match(
 ) -> Matching:
     """Pair the standstills of points with those of the joints, rad.
 
-    `names` are those of points and joints, for messages; `offset_s` is the clock offset, None to
-    find it. Raises InputError if nothing stood still, no offset joins them, or several do equally
-    well.
+    `names` are those of points and joints, for messages; `offset_s` is the clock offset, s, None
+    to find it. The best one has pairs that the robot fits to 15 % of the points' extent, if there
+    are 11 or more, else the most pairs; equal clocks and equal numbers in order are tried, too.
+    Raises InputError if nothing stood still, no offset joins them, or several do equally well.
     """
 
     def error_of(i: IntArray, j: IntArray) -> float:
@@ -317,7 +341,12 @@ def _matching(
     offset: float,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
-    """Pairs of standstills that overlap with a clock offset, s, with the refined offset."""
+    """Pairs of standstills that overlap with a clock offset, s, with the refined offset.
+
+    Each standstill of the joints gets one of the points, with which it shares over half of the
+    shorter one's time; of shots all that fall into it. ``apart_s`` is the median difference of
+    begins and ends then. No pairs if none overlap.
+    """
     begin, end = points.begin + offset, points.end + offset
     before = np.searchsorted(joints.end, begin)
     after = np.searchsorted(joints.begin, end, side='right')
@@ -359,13 +388,20 @@ def _judged(
     apart: float | None,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
-    """Matching of pairs with the residual of the robot, if there are enough pairs."""
+    """Matching of pairs (indices of points `i` and joints `j`), with the residual of the robot.
+
+    The residual is None for fewer than 11 pairs. `offset`, `apart`: s.
+    """
     error = error_of(i, j) if len(i) >= _FEWEST_FOR_ROBOT else None
     return Matching(i, j, offset, apart, error)
 
 
 def _offsets(points: Standstills, joints: Standstills) -> list[float]:
-    """Clock offsets, s, that bring many standstills together, the likeliest first."""
+    """Clock offsets, s, that bring many standstills together, the likeliest first.
+
+    To be added to the points' times; 60 at most, over 0.3 s apart, each with at least half as many
+    begins and ends as the best.
+    """
     if points.shots:
         return _offsets_of_shots(points.begin, joints)
     differences = [
@@ -387,7 +423,10 @@ def _offsets(points: Standstills, joints: Standstills) -> list[float]:
 
 
 def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
-    """Clock offsets, s, with which most shots fall into standstills: the middle of each range."""
+    """Clock offsets, s, with which most shots fall into standstills: the middle of each range.
+
+    The likeliest first, 60 at most. `shots`: their times, s.
+    """
     starts = (joints.begin[None] - shots[:, None]).ravel()
     stops = (joints.end[None] - shots[:, None]).ravel()
     at = np.concatenate((starts, stops))
@@ -413,10 +452,10 @@ def mean_of(rows: FloatArray) -> FloatArray:
 def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
     """Mean (3,) and standard deviation (3,) of a marker at a standstill.
 
-    Last result: indices of the points used.
-
-    `points` are in m, (n, 3), at least one. The deviation is NaN for a single shot. None if the
-    marker was not still.
+    Last result: indices of the points used. `points` are in m, (n, 3), at least one. Of fewer than
+    five the last is taken, with NaN as deviation. None if the marker was not still: over a tenth
+    of the points (and more than one) are far from the median, or the deviation along an axis is
+    over 0.5 mm.
     """
     if len(points) < FEWEST_SAMPLES:
         # Shots of an instrument: the last one is the one that was kept.
@@ -432,7 +471,7 @@ def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | 
 
 
 def between(stream: Stream, begin: float, end: float) -> slice:
-    """Slice of a stream from the moment the arm no longer swings after `begin` to `end`."""
+    """Slice of a stream from 0.5 s (`SWING_S`) after `begin` to before `end`, s; may be empty."""
     first, last = np.searchsorted(stream.stamps, (begin + SWING_S, end))
     return slice(int(first), int(last))
 
@@ -468,8 +507,11 @@ def stopped(
 ) -> Stopped | None:
     """Tables with one row a standstill if the joints are a stream; None if they are not.
 
-    `in_order`: pair points with standstills by their order, as the user said. Raises InputError
-    for a stream that never stands still, or standstills that do not match.
+    `angles`, `length`: units that the user stated, '' if none; `clock_offset_s`: added to the
+    points' times to have the joints', None to find it. `in_order`: pair points with standstills by
+    their order, as the user said; None also if the rows are then equally many. Raises InputError
+    for a stream that never stands still, standstills that do not match, no point at one, or a
+    prismatic joint.
     """
     reported = times(*joints)
     if reported is None or not is_stream(reported):
@@ -556,7 +598,12 @@ def _by_order(
     names: tuple[str, str],
     told: bool,
 ) -> Stopped:
-    """Pair points without times with equally many standstills, if the robot agrees or `told`."""
+    """Pair points without times with equally many standstills, if the robot agrees or `told`.
+
+    The robot agrees if it fits the first marker of 11 points or more to 15 % of their extent.
+    `reported`: times of the joints' rows, s; `unit`: of their angles, rad. Raises InputError if
+    the numbers differ or the robot disagrees.
+    """
     raw = numbers(points[0], points[1].point, optional=True)
     rows = np.flatnonzero(np.isfinite(raw).any(axis=1))
     if len(rows) != len(still):
@@ -591,7 +638,11 @@ def _by_order(
 def _unpaired(
     points: Table, kept: IntArray, when: FloatArray, span: FloatArray, offset: float | None
 ) -> tuple[str, ...]:
-    """Sentences on shots that belong to no standstill; `span` is the time of the joints, s."""
+    """Sentences on shots that belong to no standstill: in motion, or outside the record.
+
+    `kept`: rows that belong to one; `when`: times of all rows, s; `span`: times of the joints, s,
+    in order; `offset`: of the clocks, s, None for 0.
+    """
     lost = np.setdiff1d(np.flatnonzero(np.isfinite(when)), kept)
     clock = when[lost] + (offset or 0.0)
     inside = (clock >= span[0]) & (clock <= span[-1])
@@ -606,18 +657,21 @@ def _unpaired(
 
 
 def _lost(count: int, kept: IntArray, name: str) -> tuple[str, ...]:
-    """Sentence on the standstills without a point; () if there are none."""
+    """Sentence on the standstills without a point; () if there are none.
+
+    `count`: of all standstills; `kept`: indices of those with a point.
+    """
     lost = count - len(np.unique(kept))
     return (f'{lost} standstills of {name} without a point were left out',) * bool(lost)
 
 
 def _extent(values: FloatArray) -> float:
-    """Longest side of the box around points."""
+    """Longest side of the box around points (n, m); 0 without points."""
     return float(np.ptp(values, axis=0).max()) if len(values) else 0.0
 
 
 def _rows_of(stamps: FloatArray, when: FloatArray) -> IntArray:
-    """Row index of each stamp; equal stamps are different rows."""
+    """Index in `when` of each stamp; equal stamps are different rows, in order."""
     order = np.argsort(when, kind='stable')
     sorted_when = when[order]
     taken: dict[float, int] = {}
@@ -636,7 +690,11 @@ def _scale(
     windows: FloatArray,
     still: Standstills,
 ) -> float:
-    """Scale of the points to m, from their unit."""
+    """Scale of the points to m, from their unit; 1 if no window has a point.
+
+    By the stated unit (`told`), the header, or the modelled tool at the standstills. `windows`:
+    begin and end of each by the points' clock, s, (n, 2).
+    """
     parts = [stream.values[between(stream, *window)] for window in windows]
     seen = [j for j, part in enumerate(parts) if len(part)]
     if not seen:
@@ -651,7 +709,9 @@ def _means(
 ) -> tuple[IntArray, Table, int]:
     """Indices of the standstills with a point, and the table of their mean points.
 
-    Last result: the number of readings left out because the marker was not still.
+    Columns for standard deviations and the number of samples are added at the end. Last result:
+    the number of readings left out because the marker was not still. `windows`: begin and end of
+    each standstill by the clock of `when`, s, (n, 2); `scale`: unit of the points, m.
     """
     table, columns = points
     spread = {
@@ -714,7 +774,7 @@ def _means(
 
 
 def _mean_turn(turns: FloatArray) -> FloatArray:
-    """Mean of quaternions that are near each other, (4,)."""
+    """Mean of quaternions (n, 4) that are near each other, but for their sign; length 1, (4,)."""
     mean = (turns * np.where(turns @ turns[0] < 0.0, -1.0, 1.0)[:, None]).mean(axis=0)
     return np.asarray(mean / np.linalg.norm(mean))
 
@@ -722,7 +782,11 @@ def _mean_turn(turns: FloatArray) -> FloatArray:
 def _at_rest(
     joints: Table, still: Standstills, at: IntArray, reported: FloatArray, unit: float
 ) -> Table:
-    """Table of joints with one row, the mean, for each of the standstills `at`."""
+    """Table of joints with one row, the mean, for each of the standstills `at` (indices).
+
+    Other cells are those of the first row of the standstill. `reported`: times of the rows, s;
+    `unit`: of the angles, rad.
+    """
     table, columns = joints
     rows, lines = [], []
     order = np.argsort(reported, kind='stable')
@@ -737,5 +801,5 @@ def _at_rest(
 
 
 def _text(value: float, decimal: str) -> str:
-    """A number as text with a decimal sign."""
+    """A number as text, with all its digits and `decimal` as its decimal sign."""
     return repr(float(value)).replace('.', decimal)

@@ -116,7 +116,7 @@ class TextTable(NamedColumns):
         return f'{self.path}, {self.counted} {self.lines[row]}'
 
     def at_rows(self, rows: Iterable[int]) -> str:
-        """File and lines of rows, of which the first five are listed."""
+        """File and lines of rows, counted from 0, of which the first five are listed."""
         lines = [str(self.lines[row]) for row in rows]
         return f'{self.path}, {self.counted}{"s" * (len(lines) > 1)} {first_names(lines)}'
 
@@ -127,7 +127,10 @@ class TextTable(NamedColumns):
         return InputError(f'{self.at(row)}, column {self.names[column]}: {shown} {problem}')
 
     def number(self, row: int, column: int) -> float | None:
-        """Number in a cell; None if it is empty. Raises InputError if it is other text."""
+        """Number in a cell; None if it is empty or a mark for a missing value.
+
+        Indices from 0. Raises InputError if it is other text.
+        """
         cell = self.rows[row][column]
         value = parse_number(cell, self.decimal) if cell else None
         if value is None and not is_missing(cell):
@@ -135,7 +138,7 @@ class TextTable(NamedColumns):
         return value
 
     def select(self, rows: Iterable[int]) -> TextTable:
-        """Table with some of the rows."""
+        """Table with some of the rows (indices from 0), in the order given."""
         kept = list(rows)
         return replace(
             self,
@@ -145,12 +148,16 @@ class TextTable(NamedColumns):
 
 
 def is_missing(cell: str) -> bool:
-    """Whether a cell is empty or a mark for a missing value."""
+    """Whether a cell is empty or a mark for a missing value: ``n/a``, ``-``, …, in any case."""
     return not cell or cell.lower() in _MISSING
 
 
 def parse_number(cell: str, decimal: str) -> float | None:
-    """Finite number of a cell; None if the cell is no number."""
+    """Finite number of a cell; None if the cell is no number.
+
+    `decimal`: decimal sign, ',' or '.'. The other one is allowed between groups of three digits if
+    the decimal sign follows.
+    """
     other = '.' if decimal == ',' else ','
     if _THOUSANDS.fullmatch(cell) and cell.count(decimal) == 1 and _last_sign(cell) == decimal:
         cell = cell.replace(other, '')
@@ -179,7 +186,10 @@ def read_table(
 
 
 def table_of_text(text: str, path: Path) -> TextTable:
-    """Table of a tab-separated text in memory; `path` is its name in messages."""
+    """Table of a tab-separated text in memory; `path` is its name in messages.
+
+    Raises InputError as `read_table`.
+    """
     return _table(text, path, '\t', '.', CELLS)
 
 
@@ -193,7 +203,8 @@ def read_tables(
     """Read the tables of a file: one of each sheet of a workbook, else one.
 
     `sheets` are the names of the sheets to read; () for all with numbers. Raises InputError as
-    `read_table`, and if reading exceeds its limit of processor time.
+    `read_table`, for an unknown sheet, and if reading exceeds 30 s of processor time and 5 s for
+    each MiB.
     """
     data = read_limited(path, TABLE_LIMIT, 'name the table')
     if data.startswith(b'\x1f\x8b'):
@@ -218,7 +229,12 @@ def read_tables(
 def _tables_of_sheets(
     parts: Mapping[str, str], path: Path, decimal: str, sheets: Sequence[str]
 ) -> list[TextTable]:
-    """Tables with rows of numbers, of the sheets of a workbook or the arrays of an archive."""
+    """Tables with rows of numbers, of the sheets of a workbook or the arrays of an archive.
+
+    `parts`: name -> tab-separated text. Sheets that are no tables are left out, with a note on the
+    first table, unless the user named them. Raises InputError if none is left or a name is
+    unknown.
+    """
     folded = {name.casefold(): name for name in parts}
     for name in sheets:
         if name.casefold() not in folded:
@@ -251,7 +267,8 @@ def _table(
 ) -> TextTable:
     """Table of a text, by the makers' readers or as plain text.
 
-    `part` is the sheet of a workbook.
+    `part` is the sheet of a workbook; `separator` and `decimal` are found if ''. Raises InputError
+    as `read_table`.
     """
     for read in READERS:
         try:
@@ -350,7 +367,7 @@ def _table(
 
 
 def _bounded(table: TextTable) -> TextTable:
-    """The table. Raises InputError if it has too many columns, or a name that is too long."""
+    """The table. Raises InputError for over 5000 columns, or a name of over 1000 characters."""
     if len(table.names) > MOST_COLUMNS:
         raise _too_wide(table.path, min(table.lines, default=1), len(table.names))
     for name in table.names:
@@ -373,7 +390,7 @@ def _too_wide(path: Path, line: int, width: int) -> InputError:
 def _decompressed(data: bytes, path: Path) -> bytes:
     """Content of gzip data, as of PolyScope's programs.
 
-    Raises InputError if damaged or too large.
+    Raises InputError if damaged or larger than 256 MiB.
     """
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
@@ -386,11 +403,12 @@ def _decompressed(data: bytes, path: Path) -> bytes:
 
 
 def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
-    """Text of a file, and the name of its encoding.
+    """Text of a file, and the name of its encoding in capitals.
 
-    A byte order mark decides, then zeros between Latin letters (UTF-16), then whether the bytes
-    are valid UTF-8; else the encoding is Windows' Latin alphabet, which has a letter for almost
-    each byte. Raises InputError if the result contains null characters.
+    The `encoding` that is given; else a byte order mark decides, then zeros between Latin letters
+    (UTF-16), then whether the bytes are valid UTF-8; else it is Windows' Latin alphabet, which has
+    a letter for almost each byte, or Latin-1. Raises InputError if the text contains null
+    characters, or the given encoding is unknown or does not fit.
     """
     even, odd = data[:64:2], data[1:64:2]
     if encoding:
@@ -419,7 +437,10 @@ def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
 
 
 def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
-    """Cells of a line. Raises InputError if its quotes are not balanced."""
+    """Cells of a line without outer blanks. Raises InputError if its quotes are not balanced.
+
+    For the separator ' ' any run of white space separates. `path`, `number`: for the message.
+    """
     if separator == ' ':
         return _BLANKS.split(line.strip())
     try:
@@ -444,7 +465,11 @@ def _list_in_cell(cell: str) -> list[str]:
 def _with_lists_as_columns(
     split: list[tuple[int, str, list[str]]],
 ) -> list[tuple[int, str, list[str]]]:
-    """Lines with each list in a cell split into a column for each number."""
+    """Lines (number, text, cells) with each list in a cell split into a column for each number.
+
+    The first line with lists decides on their lengths; a missing list becomes empty cells, a name
+    ``name x`` to ``name z`` for three numbers, else ``name 1`` and so on.
+    """
     first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_list_in_cell, cells))), [])
     widths = [len(_list_in_cell(cell)) for cell in first]
     if not first:
@@ -468,7 +493,10 @@ def _with_lists_as_columns(
 
 
 def _without_thousands_separators(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """Cells without the blanks or apostrophes between groups of three digits."""
+    """Cells without the blanks or apostrophes between groups of three digits.
+
+    Not in columns that have a number of four digits without them.
+    """
     columns = [*zip(*rows)]
     for i, column in enumerate(columns):
         # One search over the whole column, as logs are large.
@@ -503,7 +531,10 @@ def _without_units(
 
 
 def _find_separator(lines: Sequence[str]) -> str:
-    """Separator that splits most rows into most cells with numbers."""
+    """Separator that splits most rows into most cells with numbers; ' ' if none does.
+
+    An earlier one of `SEPARATORS` is kept unless a later one gives over 1.25 times as many.
+    """
     best, most = ' ', 0
     for separator in SEPARATORS:
         split = []
@@ -534,7 +565,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _count_numbers(cell: str) -> int:
-    """Number of numbers in a cell, which may be a list."""
+    """Number of numbers in a cell, which may be a list: 0 for other text."""
     return int(_is_number(cell)) or len(_list_in_cell(cell))
 
 
@@ -569,7 +600,8 @@ def _first_row(
 ) -> tuple[int, int, IntArray]:
     """Number of columns, index of the first row, and the columns that have numbers in most rows.
 
-    Raises InputError if no line has two numbers.
+    The number of columns is that of most lines with two numbers. `split`: lines (number, text,
+    cells). Raises InputError if no line has two numbers.
     """
     rows = [
         (i, cells)
@@ -596,7 +628,9 @@ def _header(
 ) -> tuple[list[str], str, int]:
     """Names of the columns ([] if there are none), title lines above, and number of lines to skip.
 
-    The number is 0 if there are no names. `above` are the lines before the first row.
+    The number is 0 if there are no names. `above` are the lines before the first row. A line of
+    units below the names is put into them in brackets. Raises InputError if over half of such a
+    line are units, but not all.
     """
     names: list[str] = []
     over: list[str] = []
@@ -650,7 +684,7 @@ def _with_group_names(over: Sequence[str], names: list[str]) -> list[str]:
 
 
 def _find_decimal(rows: Sequence[Sequence[str]]) -> str:
-    """Decimal sign: the last sign, point or comma, of most numbers that have one."""
+    """Decimal sign: the last sign, point or comma, of most numbers that have one; else point."""
     signs: Counter[str] = Counter()
     for cells in rows:
         for cell in cells:

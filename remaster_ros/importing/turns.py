@@ -44,8 +44,10 @@ _REFERENCES = 5
 def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
     """Rows with quaternions of their orientation columns, or without orientations.
 
-    The convention is the one that agrees with the arm. Orientations are dropped, with a warning,
-    if they are computed by the robot, disagree with the arm, or fit in several conventions.
+    The convention is the one that agrees with the arm to 0.1 rad (`AGREE_RAD`, median).
+    Orientations are dropped, with a warning, if they are computed by the robot, disagree with the
+    arm, or fit in several conventions. Quaternions are kept unjudged for several markers or
+    sensors, or a sensor on the tool. Rows without any are returned as they are.
     """
     if rows.ambiguous_orientation is None and rows.orientation is None:
         return rows
@@ -114,7 +116,7 @@ _OF_THE_ROBOT = 'are how the robot itself believes its tool to be turned, not me
 
 
 def _without_orientation(rows: RawRows, why: str) -> RawRows:
-    """Rows without orientations, and the warning why."""
+    """Rows without orientations, with a warning that names the columns and says `why`."""
     note = f'{rows.ambiguous_columns or "the orientations"} {why}; left out'
     return replace(
         rows, orientation=None, ambiguous_orientation=None, warnings=(*rows.warnings, note)
@@ -124,7 +126,9 @@ def _without_orientation(rows: RawRows, why: str) -> RawRows:
 def _conventions(values: FloatArray, unit: str) -> Iterator[tuple[str, FloatArray]]:
     """Yield conventions in which columns (n, 3) or (n, 4) can be read.
 
-    Each is its name in words and the quaternions, (n, 4).
+    Each is its name in words and the quaternions x, y, z, w, (n, 4), NaN where a number is
+    missing. `unit`: 'deg', 'rad' or ''; without it degrees if an angle is above 2.1 π, else both.
+    Nothing for four numbers whose length is not 1 within 0.01.
     """
     known = np.isfinite(values).all(axis=1)
     if values.shape[1] == len('xyzw'):
@@ -167,8 +171,9 @@ def _orientation_error(
     """Median difference of measured orientations from those of the arm, rad.
 
     `arms` are the tool poses, (n, 4, 4), for each way to count the joints; the best one counts. If
-    not `ignore_points`, it is inf if the sensor's orientation disagrees with the points; also inf
-    if there are too few rows.
+    not `ignore_points`, it is inf if the sensor's orientation disagrees with the points by over
+    0.2 rad; also inf with fewer than 8 rows (`FEWEST_ROWS`). `xyzw`: quaternions, (n, 4), NaN if
+    unknown.
     """
     known = np.flatnonzero(np.isfinite(xyzw).all(axis=1))
     if len(known) < FEWEST_ROWS:
@@ -211,7 +216,7 @@ def _sensor_rotation(position: FloatArray, T: FloatArray) -> Rotation:
 
 
 def _differ(xyzw: FloatArray, other: FloatArray) -> bool:
-    """Whether two arrays of quaternions (n, 4) are different orientations."""
+    """Whether two arrays of quaternions x, y, z, w, (n, 4), differ by over 5 mrad (median)."""
     known = np.isfinite(xyzw).all(axis=1)
     between = Rotation.from_quat(xyzw[known]).inv() * Rotation.from_quat(other[known])
     return bool(np.median(between.magnitude()) > OTHER_RAD / 4.0)

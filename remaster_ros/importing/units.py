@@ -51,13 +51,13 @@ _OTHERS = {
 
 
 def other_unit(header: str) -> str:
-    """Unit at the end of a header that nothing converts; '' if there is none."""
+    """Unit at the end of a header that nothing converts, as written; '' if there is none."""
     found = _IN_BRACKETS.search(header) or _AT_END.search(header)
     return found[1] if found and found[1].lower() in _OTHERS else ''
 
 
 def unit_of(text: str) -> str:
-    """Unit in a text, as a key of `SI`; '' if the text is no known unit."""
+    """Unit in a text, as a key of `SI`; '' if the text is no known unit. Case is ignored."""
     word = bare(text).lower()
     word = _WORDS.get(word, word)
     return word if word in SI else ''
@@ -69,12 +69,16 @@ def is_unit(text: str) -> bool:
 
 
 def bare(text: str) -> str:
-    """A unit without the brackets around it."""
+    """A unit without blanks and brackets around it."""
     return text.strip().strip('[]()').strip()
 
 
 def split_unit(header: str) -> tuple[str, str]:
-    """Name of a column without its unit, and the unit ('' if it has none)."""
+    """Name of a column without its unit, and the unit ('' if it has none), a key of `SI`.
+
+    ``X [mm]``, ``x/mm``, ``x in mm``, ``x_mm`` and ``xmm`` are X in mm; single letters at the end
+    are no units, except in ``x_m``.
+    """
     found = _IN_BRACKETS.search(header) or _AFTER_SLASH.search(header)
     if found and unit_of(found[1]):
         return header[: found.start()].strip(), unit_of(found[1])

@@ -98,7 +98,8 @@ def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) 
 def angle_unit(table: TextTable, columns: Columns, stated_unit: str) -> tuple[str, str]:
     """Unit of the joint angles, and how it is known: 'told', 'header' or 'guessed'.
 
-    `stated_unit` is the user's, '' if none. Raises InputError if the headers have several units.
+    `stated_unit` is the user's, '' if none. Guessed are rad if all angles are below 2.1 π, else
+    deg. Raises InputError if the headers have several units.
     """
     units = {columns.units.get(i, '') for i in columns.joints} - {''}
     if stated_unit:
@@ -166,8 +167,9 @@ def length_unit(
 ) -> tuple[str, str]:
     """Unit of the points, and how it is known: 'told', 'header' or 'guessed'.
 
-    `points` are the points as written, (n, 3). If nothing states the unit, it is the one in which
-    their spread is nearest to that of the points `modelled` of the robot, m, (n, 3).
+    `points` are the points as written, (n, 3). If nothing states the unit, it is the one of m, mm
+    and in with which their spread is nearest to that of the points `modelled` of the robot, m, (n,
+    3). Raises InputError if the headers have several units.
     """
     units = {columns.units.get(i, '') for i in columns.point} - {''}
     if stated_unit:
@@ -190,7 +192,7 @@ def length_unit(
 
 
 def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
-    """Raise InputError for the first point that is beyond the range of any sensor."""
+    """Raise InputError for the first point with a coordinate beyond 200 m (`FARTHEST_M`)."""
     far = np.abs(numbers(table, columns.point, optional=True)) * LENGTHS[unit] > FARTHEST_M
     for row, i in np.argwhere(far)[:1]:
         raise table.fault(
@@ -205,7 +207,9 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
     """Times of the rows, s, (n,); None if the table has none.
 
     A time is a number, ISO 8601, or a date and a time as programs write them (dates with points
-    have the day first), in one column or in two. Raises InputError for text that is no time.
+    have the day first), in one column or in two. Dates become seconds since 1970; numbers without
+    a unit are s, or ms, µs or ns if they are as large as times since 1970, or days of a
+    spreadsheet. Raises InputError for text that is no time.
     """
     column = columns.first_of_kind('time')
     clock, date = columns.first_of_kind('clock'), columns.first_of_kind('date')
@@ -240,7 +244,11 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
 
 
 def _time(text: str, decimal: str, day_first: bool) -> float | None:
-    """Time of a cell, s; None if the cell is no time."""
+    """Time of a cell, s, or the number that it is; None if the cell is no time.
+
+    Dates count from 1970 in local time, unless a zone is stated; a time of day is on 1 January
+    2000.
+    """
     if len(text) > _LONGEST_TIME:
         return None
     number = parse_number(text, decimal)
@@ -282,13 +290,20 @@ def _in_english(text: str) -> str:
 
 
 def _are_clocks(texts: Sequence[str]) -> bool:
-    """Whether times of day are written with points: a second number above 12 is no month."""
+    """Whether times of day are written with points, such as 14.30.05, in all cells.
+
+    A second number above 12, or 0, somewhere shows that they are no dates.
+    """
     found = [_CLOCK.fullmatch(text) for text in texts]
     return all(found) and any(not 0 < int(match[2]) <= _MOST_MONTHS for match in found if match)
 
 
 def _is_day_first(texts: Sequence[str]) -> bool:
-    """Whether dates have the day before the month, judged from the whole column."""
+    """Whether dates have the day before the month, judged from the whole column.
+
+    So if they have points, if a first number is above 12, or if the first changes and the second
+    does not.
+    """
     found = [match for match in map(_DATE.match, texts) if match]
     first, second = [int(match[1]) for match in found], [int(match[3]) for match in found]
     if any(match[2] == '.' for match in found) or max(first, default=0) > _MOST_MONTHS:
