@@ -164,6 +164,7 @@ class ArmSupervisor:
 
         A move under way is stopped first. ``waypoints`` has configurations on the way to a
         solution, (n, k), by its number, from 0; ``refused`` why one of them must not be commanded.
+        ``wall_s``: now, wall time, s.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
         actions += self._step(Event.NEW_POSE)
@@ -174,6 +175,7 @@ class ArmSupervisor:
         """Process the recorder's answer that a settled configuration is done; return actions.
 
         The actions of `tick` are always included; an answer on another solution has no others.
+        ``solution``: its index in the pose's solutions; ``wall_s``: now, wall time, s.
         """
         actions: list[Action] = []
         visit = self._motion.visit
@@ -184,7 +186,10 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
-        """Process whether the robot's own safety circuit stops the arm; if so, halt."""
+        """Process whether the robot's own safety circuit stops the arm; if so, halt.
+
+        ``wall_s``: now, wall time, s.
+        """
         self._interlocks.set('safety', 'the robot reports an emergency stop' if stopped else '')
         return self.tick(wall_s)
 
@@ -194,6 +199,7 @@ class ArmSupervisor:
         ``name`` is one of `interlocks.OBSERVED`, ``trouble`` what is wrong with it; ''. Rivals
         (other publishers of what moves the arm) always halt a collection. The others halt it if
         they were right before; else they only hold it, because they take a while at the start.
+        ``wall_s``: now, wall time, s.
         """
         halts = name == 'rivals' or self._interlocks.was_right(name)
         self._interlocks.set(name, trouble)
@@ -227,6 +233,7 @@ class ArmSupervisor:
         """Process a message on joint_states that has none of the arm's joints: a gripper's, say.
 
         ``why``: text of `trouble` while the arm's own reports are silent and such messages come.
+        ``wall_s``: when it came, s.
         """
         self._others, self._others_wall = why, wall_s
 
@@ -235,7 +242,8 @@ class ArmSupervisor:
 
         It lasts if for more than `DOUBT_S` none was believed. ``jumped`` says that the arm was
         reported at a place that it cannot have reached: that halts even without a collection.
-        Else, unless paused, what is usual in the reports is learned anew.
+        Else, unless paused, what is usual in the reports is learned anew. ``why``: for people;
+        ``wall_s``: when the report came, s.
         """
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
@@ -256,7 +264,8 @@ class ArmSupervisor:
         """Process the answer to the last `CheckPath`; an answer to an earlier one is ignored.
 
         With a path the move begins, unless the arm is blocked or has moved since; without one the
-        configuration is refused, or the arm halted if it stands where it must not.
+        configuration is refused, or the arm halted if it stands where it must not. ``number``:
+        that of the `CheckPath`; ``wall_s``: now, wall time, s.
         """
         asked, seen = self._queue.asked(number), self._seen
         if self.state is not Arm.ASKS or asked is None:
@@ -313,6 +322,7 @@ class ArmSupervisor:
         """Use other limits from now on; a move under way is stopped and commanded again.
 
         After one that is `raised` nothing moves before a person begins the collection again.
+        ``wall_s``: now, wall time, s.
         """
         actions = self._stop('other limits', wall_s)
         self.gate.limits = limits
@@ -332,6 +342,7 @@ class ArmSupervisor:
         """Halt, as this program has failed in a step, which may be half done.
 
         The arm is stopped first if it is known to follow its path; [] if it is halted already.
+        ``why``: the fault, for people; ``wall_s``: now, wall time, s.
         """
         return [] if self.halted else self._halt_braking(why, wall_s)
 
@@ -348,7 +359,7 @@ class ArmSupervisor:
 
         A move is decided again after all that arrived meanwhile is processed. A stop that was not
         sent halts: the arm goes on, and its present place is unknown. A renewal needs no action:
-        the piece before it ends in a stop.
+        the piece before it ends in a stop. ``wall_s``: now, wall time, s.
         """
         self._motion.take_back()
         if isinstance(command, Renew):
@@ -416,7 +427,10 @@ class ArmSupervisor:
         return self._motion.next_end
 
     def use_stamps(self, *, kept: bool) -> None:
-        """Send moves from now on with stamps or without, as in `SupervisorRules.keeps_stamps`."""
+        """Send moves from now on with stamps or without, as in `SupervisorRules.keeps_stamps`.
+
+        ``kept``: whether the controller keeps the stamps of trajectories.
+        """
         self._keeps_stamps = kept
 
     @property
@@ -436,11 +450,17 @@ class ArmSupervisor:
         return self._interlocks.reason('robot') or (self._others if others else '')
 
     def report_age_s(self, wall_s: float) -> float:
-        """Time since a report was believed, s; infinite if none was."""
+        """Time since a report was believed, s; infinite if none was.
+
+        ``wall_s``: now, wall time, s.
+        """
         return self._interlocks.silence_s('robot', wall_s)
 
     def blocked(self, wall_s: float) -> str:
-        """Why the arm must not move; '' if it may."""
+        """Why the arm must not move; '' if it may.
+
+        A halt, else the first reason of `Interlocks.blocked`; ``wall_s``: now, wall time, s.
+        """
         return self.halted or self._interlocks.blocked(wall_s)
 
     # Inside: reasons not to move
@@ -477,7 +497,8 @@ class ArmSupervisor:
         """Actions that send the next piece of a move, if one is due; [] if not.
 
         None is sent if the arm is not seen to follow, or the gate refuses it: the present piece
-        ends in a stop. If that stop is about to begin, the move counts as missed.
+        ends in a stop. If that stop is about to begin, the move counts as missed. ``wall_s``: now,
+        s.
         """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
@@ -510,7 +531,7 @@ class ArmSupervisor:
 
         Before a solution, in this order: halt after `MISSED_IN_A_ROW`, or if the arm is not where
         it was led; check where it stands; the probe; an allowed way out. Solutions outside the
-        limits are refused, and the way to the next one is asked for.
+        limits are refused, and the way to the next one is asked for. ``wall_s``: now, s.
         """
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
@@ -546,6 +567,7 @@ class ArmSupervisor:
         """Actions that begin a move; [] if the arm has moved since its path was checked.
 
         ``solution``: its index, or `PROBE`, `WAY_OUT`. A move that the gate refuses is given up.
+        ``wall_s``: now, s.
         """
         # A stamp that is not of the controller's clock would lead the arm to another time.
         self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
@@ -567,6 +589,7 @@ class ArmSupervisor:
         """Actions after a refused move: the next solution, or a halt if it is no solution's.
 
         ``solution``: its index; negative for a probe, a way out, or the check of where it stands.
+        ``reason``: for people; ``wall_s``: now, s.
         """
         if solution < 0:
             return self._halt(reason)
@@ -576,7 +599,8 @@ class ArmSupervisor:
     def _refuse(self, solution: int, reason: str) -> list[Action]:
         """Actions after a configuration was refused: `Failed`, and the next one is next.
 
-        A halt after `REFUSED_IN_A_ROW` of them, none reached between.
+        A halt after `REFUSED_IN_A_ROW` of them, none reached between. ``solution``: its index;
+        ``reason``: for people.
         """
         self._queue.next = solution + 1
         self._refusals += 1
@@ -610,6 +634,7 @@ class ArmSupervisor:
 
         ``solution``: its index. `rules.failures_in_a_row` of them halt; one that has settled, and
         was not answered in time, does not count. The arm stands, so that no stop is needed.
+        ``reason``: for people.
         """
         if self.state is Arm.MOVES:
             self._failures += 1
@@ -630,7 +655,8 @@ class ArmSupervisor:
     def _halt_braking(self, reason: str, wall_s: float) -> list[Action]:
         """Actions that halt an arm; it is stopped first if it is known to follow its path.
 
-        Known is an arm that is not `lost`; otherwise nothing is commanded.
+        Known is an arm that is not `lost`; otherwise nothing is commanded. ``reason``: for people;
+        ``wall_s``: now, s.
         """
         seen = self._seen
         if seen is not None and self.state in (Arm.LEAVES, Arm.MOVES):
@@ -645,6 +671,7 @@ class ArmSupervisor:
         """Stop an arm that is on its way; the configuration is commanded again later.
 
         [] if it is on no way, or ends by itself. It is halted if its place on the path is unknown.
+        ``reason``: for people; ``wall_s``: now, s.
         """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):

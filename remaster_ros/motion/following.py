@@ -90,11 +90,17 @@ class Seen:
         return cls(q, stamp, wall, time, at, since, late_s, changed, resumed)
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether this report is at most `FRESH_S` old."""
+        """Whether this report is at most `FRESH_S` old.
+
+        ``wall_s``: now, wall time, s.
+        """
         return wall_s - self.wall <= FRESH_S
 
     def stands(self, wall_s: float) -> bool:
-        """Whether the arm has stood for `STANDING_S`, and the report is fresh (`is_fresh`)."""
+        """Whether the arm has stood for `STANDING_S`, and the report is fresh (`is_fresh`).
+
+        ``wall_s``: now, wall time, s.
+        """
         return self.time - self.stands_since >= STANDING_S and self.is_fresh(wall_s)
 
     def frozen(self) -> BoolArray:
@@ -102,7 +108,10 @@ class Seen:
         return self.time - self.changed > VARIES_S
 
     def now(self, wall_s: float, rate: float) -> float:
-        """Return robot time now, s, for a clock that runs at `rate`."""
+        """Return robot time now, s, for a clock that runs at `rate`.
+
+        ``wall_s``: wall time now, s; ``rate``: robot time per wall time.
+        """
         return self.time + rate * (wall_s - self.wall)
 
 
@@ -163,7 +172,7 @@ class Following:
         """Return why the arm's place on its path is unknown, or ''.
 
         It is if the last report is not fresh, or by it the arm has not moved yet for longer than
-        it may lag, is off its path, or loses speed (`_is_slowed`).
+        it may lag, is off its path, or loses speed (`_is_slowed`). ``wall_s``: now, wall time, s.
         """
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
@@ -178,6 +187,7 @@ class Following:
         where it should be, or lags without its lag growing by `SLOWED_SHARE` of the time. For a
         stop it is enough to know where the arm may be (`lost`); what leads it on is for one that
         moves: a controller may join it to an arm that has been stopped since by a jump.
+        ``wall_s``: now, s; ``rate``: robot time per wall time.
         """
         if wall_s - seen.wall > JUST_S or not self._trail:
             return 'joint_states do not come'
@@ -204,7 +214,7 @@ class Following:
         The later one is where the controller's reference is: a stop takes as long to get there as
         the move did, give or take `JITTER_S`. If the last report came late, it has gone on for so
         long. The earlier one is where an arm is that lags, and that has been stopped by itself
-        since the last report.
+        since the last report. ``wall_s``: now, s; ``rate``: robot time per wall time.
         """
         reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
@@ -217,7 +227,8 @@ class Following:
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command.
 
-        It is, with the lag seen last, `JITTER_S` after the trajectory's duration.
+        It is, with the lag seen last, `JITTER_S` after the trajectory's duration. ``wall_s``: now,
+        s; ``rate``: robot time per wall time.
         """
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
         return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
@@ -227,6 +238,7 @@ class Following:
 
         It follows if it is within `ON_PATH_RAD` of the path and, along it, near its place or
         within the allowed lag and lead. Before it reacts it may stand for `rules.reaction_s`.
+        ``elapsed``: robot time since it was sent, s.
         """
         if not self.reacted:
             still = self._is_still_at_start(seen)

@@ -45,7 +45,10 @@ class Interlocks:
         self._looked_wall: float | None = None
 
     def note_alive(self, name: str, reason: str, wall_s: float) -> None:
-        """Note a sign of life of an origin at `wall_s`, s, and its reason not to move, or ''."""
+        """Note a sign of life of an origin at `wall_s`, s, and its reason not to move, or ''.
+
+        ``name``: one of `NAMES`.
+        """
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, state: str, run: str, wall_s: float) -> bool:
@@ -70,15 +73,24 @@ class Interlocks:
         return began_another
 
     def set(self, name: str, reason: str) -> None:
-        """Process an origin's reason not to move, or ''."""
+        """Process an origin's reason not to move, or ''.
+
+        ``name``: the origin, such as one of `OBSERVED`; it is no sign of life.
+        """
         self._reasons[name] = reason
 
     def reason(self, name: str) -> str:
-        """Return an origin's reason not to move, or ''."""
+        """Return an origin's reason not to move, or ''.
+
+        ``name``: the origin; '' also if nothing was heard of it.
+        """
         return self._reasons.get(name, '')
 
     def was_right(self, name: str) -> bool:
-        """Whether an origin was observed, and gave no reason against a motion."""
+        """Whether an origin was observed, and gave no reason against a motion.
+
+        False if nothing was heard of it; ``name``: the origin.
+        """
         return self._reasons.get(name) == ''
 
     def look(self, wall_s: float) -> None:
@@ -94,13 +106,17 @@ class Interlocks:
         self._seen = {name: min(seen + pause, wall_s) for name, seen in self._seen.items()}
 
     def silence_s(self, name: str, wall_s: float) -> float:
-        """Return the time since the last sign of life, s; infinite if there was none."""
+        """Return the time since the last sign of life, s; infinite if there was none.
+
+        ``name``: one of `NAMES`; ``wall_s``: now, s.
+        """
         return wall_s - self._seen[name] if name in self._seen else np.inf
 
     def fell_silent(self, name: str, wall_s: float) -> str:
         """Return that an origin which gave signs of life is silent now; '' if it is not.
 
-        Silent is for more than `heartbeat_s`; '' also if it has given none.
+        Silent is for more than `heartbeat_s`; '' also if it has given none. ``name``: one of
+        `NAMES`; ``wall_s``: now, s.
         """
         if name in self._seen and self.silence_s(name, wall_s) > self._heartbeat_s:
             return f'no sign of {name} for {self._heartbeat_s:g} s'
@@ -113,11 +129,17 @@ class Interlocks:
         return runs and self.consent is not Consent.ASKED
 
     def note_moved(self) -> None:
-        """Process that the arm is moved."""
+        """Process that the arm is moved.
+
+        From then on a hindrance counts as an interruption of this run.
+        """
         self._moved = True
 
     def interrupted(self, since_wall_s: float) -> None:
-        """Process that nobody has looked at the arm since then, s: this process was not there."""
+        """Process that nobody has looked at the arm since then, s: this process was not there.
+
+        ``since_wall_s``: wall time, s; the consent is held then, see `look_at_interruption`.
+        """
         self._held_since_wall, self._released = since_wall_s, False
         self.say(Word.HINDERED)
 
@@ -125,7 +147,7 @@ class Interlocks:
         """Process that the arm stops by itself, without a reason known to this program.
 
         As after any interruption: where nothing shows who stops the arm meanwhile, a person goes
-        on.
+        on. ``wall_s``: now, s.
         """
         if self.consent is Consent.GIVEN:
             self._held_since_wall, self._released = wall_s, self._is_released
@@ -142,7 +164,10 @@ class Interlocks:
         self.say(Word.REVOKED)
 
     def say(self, word: Word) -> None:
-        """Change the consent to move by the table `states.CONSENT`."""
+        """Change the consent to move by the table `states.CONSENT`.
+
+        An event without a row changes nothing.
+        """
         self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
@@ -150,7 +175,7 @@ class Interlocks:
 
         Only after the arm was moved in this run. Longer than `resume_alone_s` a person may stand
         beside the arm; none is needed if the robot itself reported all the time that it is not
-        stopped.
+        stopped. ``wall_s``: now, s.
         """
         released = self._is_released
         reason = self._hindrance(wall_s)
@@ -174,7 +199,10 @@ class Interlocks:
             self.say(Word.FREE)
 
     def blocked(self, wall_s: float) -> str:
-        """Return the first reason not to move (silence, trouble, a person's consent), or ''."""
+        """Return the first reason not to move (silence, trouble, a person's consent), or ''.
+
+        ``wall_s``: now, s.
+        """
         return self._hindrance(wall_s) or self.asks_for_collect
 
     @property
@@ -184,7 +212,10 @@ class Interlocks:
         return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 
     def _hindrance(self, wall_s: float) -> str:
-        """First reason not to move: silent nodes, then reasons in the order of the names; ''."""
+        """First reason not to move: silent nodes, then reasons in the order of the names; ''.
+
+        Silent is for more than `heartbeat_s`, or never heard; ``wall_s``: now, s.
+        """
         limit = self._heartbeat_s
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]
         if silent:

@@ -60,7 +60,10 @@ class LedLast:
         self._places = self._before
 
     def differs(self, q: FloatArray, other: FloatArray) -> bool:
-        """Whether two joint positions, (k,), are further apart than the tolerance."""
+        """Whether two joint positions, (k,), are further apart than the tolerance.
+
+        In any joint; of a slide the tolerance is as in `JointUnits`.
+        """
         return self._units.largest(q - other) > self._tolerance_rad
 
     def elsewhere(self, q: FloatArray) -> str:

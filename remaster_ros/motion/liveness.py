@@ -100,7 +100,10 @@ class Liveness:
         self._new.discard(sensor)
 
     def read_age_s(self, sensor: str, now_s: float) -> float:
-        """Time since the last reading, s; infinite if there was none."""
+        """Time since the last reading, s; infinite if there was none.
+
+        ``now_s``: now, by the clock of `reads`, s.
+        """
         return now_s - self._read.get(sensor, float('-inf'))
 
     def absent(self, now_s: float, required: Collection[str] = ()) -> dict[str, str]:
@@ -109,7 +112,7 @@ class Liveness:
         Its node is silent for more than `heartbeat_s`, or reports that it is not ready; a stream
         without a reading since its node's start is absent too. A sensor whose node never reported
         is not, because a bag may hold readings alone; one that is ``required`` is, while its node
-        may still be starting.
+        may still be starting. ``now_s``: now, s.
         """
         why = {}
         for name in self.readings:

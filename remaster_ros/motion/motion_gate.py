@@ -432,7 +432,8 @@ class ForeignGate:
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
         """Raise StartMovedError if the trajectory does not begin at the arm, at rest.
 
-        It may begin `START_RAD` away, and the arm may move at `SLOW_RAD_S`.
+        It may begin `START_RAD` away, and the arm may move at `SLOW_RAD_S`. ``q, velocity``: where
+        the arm is, rad or m, and how fast, per s, (k,).
         """
         off, units = np.abs(first.q - q), self.limits.units
         if not units.largest(off) <= START_RAD:
@@ -521,7 +522,8 @@ class Cubic:
     ) -> Cubic:
         """Return the cubics by Hermite data: durations, s, (n, 1), positions and speeds (n, k).
 
-        Coefficients of a duration of 0 are not finite.
+        Coefficients of a duration of 0 are not finite. Those at the start, then those at the end;
+        rad or m, per s.
         """
         gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):
@@ -530,12 +532,18 @@ class Cubic:
         return cls(duration_s, np.array([q, velocity, second, third]))
 
     def at(self, time_s: float | FloatArray) -> FloatArray:
-        """Return positions, rad or m, (k,) or (n, k) for times (n,)."""
+        """Return positions, rad or m, (k,) or (n, k) for times (n,).
+
+        ``time_s``: since the start, s; beyond the end the cubic goes on.
+        """
         powers = np.power.outer(time_s, np.arange(4))
         return powers @ self.coefficients
 
     def velocity(self, time_s: float | FloatArray) -> FloatArray:
-        """Return velocities, rad/s or m/s, (k,) or (n, k)."""
+        """Return velocities, rad/s or m/s, (k,) or (n, k).
+
+        ``time_s``: since the start, s; one or (n,).
+        """
         powers = np.power.outer(time_s, np.arange(3))
         return powers @ (self.coefficients[1:] * np.array([[1.0], [2.0], [3.0]]))
 

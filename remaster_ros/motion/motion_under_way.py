@@ -309,6 +309,8 @@ class MotionUnderWay:
     def renew(self, seen: Seen, wall_s: float) -> Renew:
         """Return the next piece of the move, which is the present one from then on.
 
+        ``wall_s``: now, s.
+
         Raises MotionRefusedError as `MotionGate.renew` and `MotionGate.step`. There must be a
         visit.
         """
@@ -353,6 +355,7 @@ class MotionUnderWay:
         """Return the outcome of a report for the move or the stop; UNDER_WAY without either.
 
         See `Visit` and `Braking`. How far the arm has settled from its target is kept, for `near`.
+        ``rate``: robot time per wall time; ``recorder_waits``: as of `Visit.judge_settled`.
         """
         if self.braking is not None:
             return self.braking.judge(seen)
@@ -366,7 +369,10 @@ class MotionUnderWay:
         return outcome
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why a moving arm's place on its path is unknown, or ''; see `Following.lost`."""
+        """Return why a moving arm's place on its path is unknown, or ''; see `Following.lost`.
+
+        ``wall_s``: now, s. There must be a visit.
+        """
         assert self.visit is not None
         return self.visit.following.lost(seen, wall_s)
 
@@ -374,6 +380,7 @@ class MotionUnderWay:
         """Return why reports do not show a moving arm going on along its path, or ''.
 
         See `Following.unseen`; '' for a controller that does not keep stamps, whose arm stands.
+        ``wall_s``: now, s; ``rate``: robot time per wall time. There must be a visit.
         """
         assert self.visit is not None
         if not self._keeps_stamps:

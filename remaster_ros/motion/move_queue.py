@@ -53,7 +53,10 @@ class MoveQueue:
         waypoints: Mapping[int, FloatArray],
         refused: Mapping[int, str],
     ) -> None:
-        """Begin another pose, with its first solution next; see `ArmSupervisor.plan`."""
+        """Begin another pose, with its first solution next; see `ArmSupervisor.plan`.
+
+        ``waypoints``: on the way to a solution, ``refused``: why one is not visited, by its index.
+        """
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
         self._refused = refused
 

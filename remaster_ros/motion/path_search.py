@@ -49,5 +49,8 @@ class PathSearch:
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
 
     def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
-        """Return points (n, k) as a path, with the peak speeds of its lines."""
+        """Return points (n, k) as a path, with the peak speeds of its lines.
+
+        ``is_way_out``: whether it leads out of a contact, and is gone slowly.
+        """
         return FreePath(points, self._speeds.peaks_m(points), is_way_out)

@@ -124,7 +124,7 @@ def _piece(
     """Return the waypoints, and until when the arm is on the trajectory, s (inf for the last).
 
     Behind that is a stop in `RAMP_S` on the line; a line's own ramp is taken if the stop would
-    fall into it.
+    fall into it. ``sent_s``: s from the trajectory's start; ``horizon_s``: as of `piece_of`.
     """
     begins_s = max(sent_s - PAST_S, min(sent_s - LEAST_PAST_S, RAMP_S), 0.0)
     points = [p for p in trajectory.waypoints() if p.time_s > begins_s + SAME_S]

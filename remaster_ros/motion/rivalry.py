@@ -76,5 +76,8 @@ class DuplicateNodeCheck:
         return shorter_by_s > SHORTER_S
 
     def alone(self, now_s: float) -> bool:
-        """Whether this node has listened for `LISTEN_S` without a summary of a rival."""
+        """Whether this node has listened for `LISTEN_S` without a summary of a rival.
+
+        ``now_s``: of a monotonic clock, s; False before its own first summary.
+        """
         return self.alone_since_s is not None and now_s - self.alone_since_s >= LISTEN_S

@@ -133,7 +133,10 @@ class Line:
 
 
 def _ramp(time_s: float) -> tuple[float, float]:
-    """Return a speed that goes from 0 to 1 in `RAMP_S`, and its integral, s."""
+    """Return a speed that goes from 0 to 1 in `RAMP_S`, and its integral, s.
+
+    ``time_s``: from the ramp's start, s; 0 before, and 1 after `RAMP_S`.
+    """
     speed = min(max(time_s / RAMP_S, 0.0), 1.0)
     return speed, 0.5 * RAMP_S * speed**2 + max(time_s - RAMP_S, 0.0)
 

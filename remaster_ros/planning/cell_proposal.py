@@ -213,7 +213,8 @@ def ranges_around(places: FloatArray) -> PoseRanges:
     """Return ranges around the middle of reachable tool positions, m, (n, 3), n >= 1.
 
     Quantiles 0.1 to 0.9 of radius and height, in steps of 1 cm; 0.05 to 0.95 of azimuth, in steps
-    of 5 degrees, or a whole turn if that is wider than 300 degrees.
+    of 5 degrees, or a whole turn if that is wider than 300 degrees. ``places``: of the tool in the
+    base frame.
     """
     radius = np.quantile(np.linalg.norm(places[:, :2], axis=1), (0.1, 0.9))
     height = np.quantile(places[:, 2], (0.1, 0.9))

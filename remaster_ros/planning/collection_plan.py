@@ -133,7 +133,7 @@ def look_ahead(
 
     ``tours``: one after the other; ``visit``: remaining visit of the pose under way, which comes
     first; other arguments as of `plan_collection`. If the poses do not determine the offsets, the
-    plan has `undetermined`.
+    plan has `undetermined`. ``start``: configuration of the arm, rad or m, (k,).
 
     Raises InsufficientDataError if no configuration can be reached.
     """

@@ -231,7 +231,7 @@ class DesignInformation:
         """Return the first-order decrease of trace(L' M^-1 L) by each configuration, (n,).
 
         It is trace(K' dM K) for the information dM that the configuration adds and K = M^-1 L,
-        which is ``root``, (f, r).
+        which is ``root``, (f, r). ``chosen``: indices of the configurations so far.
         """
         sums, count = self._sums(chosen)
         of_sums, of_each = sums @ root, self.weighted @ root
@@ -278,7 +278,10 @@ class DesignInformation:
         return information + UNKNOWN * np.eye(len(self.scale))
 
     def joint_std(self, chosen: Sequence[int]) -> dict[str, float | None]:
-        """Return each joint's expected std by name, rad or m; None if not identifiable."""
+        """Return each joint's expected std by name, rad or m; None if not identifiable.
+
+        ``chosen``: indices of the configurations that are measured.
+        """
         variance = np.diag(self.covariance(chosen))
         return {
             name: float(np.sqrt(variance[self.identifiable[joint]]))
@@ -291,7 +294,7 @@ class DesignInformation:
         """Return the root mean square of the identifiable joints' standard deviations, rad.
 
         That of a prismatic joint is divided by `SerialChain.per_radian`. NaN if no joint is
-        identifiable.
+        identifiable. ``chosen``: indices of configurations.
         """
         std = [
             value / unit

@@ -185,7 +185,8 @@ def designed_plans(
 def _floors(information: DesignInformation, candidates: IntArray, whole_poses: bool) -> Floors:
     """Return the floors, lowered to what these configurations can reach.
 
-    All whole poses should have two solutions, for which they are visited whole.
+    All whole poses should have two solutions, for which they are visited whole. ``candidates``:
+    indices of the configurations.
     """
     count = np.unique(information.pose[candidates], return_counts=True)[1]
     floors = Floors()

@@ -331,7 +331,7 @@ class _Search:
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
         """Return the units extended until the design is done or has `most` configurations.
 
-        Also without reaching the goal, when all units are chosen.
+        Also without reaching the goal, when all units are chosen. ``chosen``: indices of units.
         """
         chosen = list(chosen)
         while len(chosen) < len(self._information) and not self.is_done(chosen):
@@ -362,7 +362,7 @@ class _Search:
     def thinned(self, chosen: Sequence[int]) -> list[int]:
         """Return the design with superfluous units removed, the least useful first.
 
-        It stays done; at least one unit remains.
+        It stays done; at least one unit remains. ``chosen``: indices of units.
         """
         chosen = list(chosen)
         while len(chosen) > 1 and self.is_done(fewer := self._without_least(chosen)):
@@ -393,7 +393,7 @@ class _Search:
     def spent(self, chosen: Sequence[int]) -> float:
         """Return the robot time of units, each reached from its nearest neighbour, s.
 
-        With measuring; without travel for a single unit.
+        With measuring; without travel for a single unit. ``chosen``: indices of units.
         """
         which = np.array(chosen, dtype=np.int64)
         near = np.min([self._units.near(index)[which] for index in chosen], axis=0)

@@ -58,7 +58,7 @@ def causes(chain: SerialChain, places: Sequence[Place]) -> list[Cause]:
     A sensor is moved; the base (or all sensors on one stand) is moved; one marker slips; the tool
     with all markers slips (only with several markers); the encoder of a joint slips. In this
     order. With one sensor its motion and that of the base cannot be distinguished, and are one
-    cause.
+    cause. ``places``: markers at the references; the Jacobians are in their order.
     """
     q = np.array([place.q for place in places])
     markers_T = np.array([place.marker_T for place in places])
@@ -165,6 +165,7 @@ def _exchanged(
     ``moves``: of each rigid motion the signals of the candidates, (n, 3 S, 6). Returns the
     references and their smallest singular value; the exchange ends after `MOST_EXCHANGES` rounds,
     or as soon as that is `wanted`, since the first choice distinguishes the causes best.
+    ``chosen``: indices of the candidates.
     """
     best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
     for _ in range(MOST_EXCHANGES):

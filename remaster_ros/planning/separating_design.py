@@ -281,7 +281,10 @@ class _Choice:
         )
 
     def _separation(self, both: tuple[Rivals, ...], chosen: Sequence[int]) -> float:
-        """Return the smaller of the separations in both directions."""
+        """Return the smaller of the separations in both directions.
+
+        ``chosen``: indices of the configurations measured.
+        """
         return min(separation(self._information(pair), chosen) for pair in both)
 
     def _most_separating(self) -> list[int]:
@@ -322,6 +325,7 @@ class _Choice:
         """Set the previous configuration of all remaining ones to q, rad or m, (k,).
 
         The information of pairs that depend on it is computed anew. Nothing without `measured`.
+        ``directions``: all pairs.
         """
         if self.measured is not None:
             self._from_q[remaining] = q

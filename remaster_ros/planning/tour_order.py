@@ -215,6 +215,7 @@ class Tour:
         """Return split and index of the next pose of a tour without a given order.
 
         Nearest by the distance of the tool; the first one if the tour is `in_order`.
+        ``unvisited``: split and index of the poses to choose from; q: rad or m, (k,).
         """
         position = self.chain.forward(q)[:3, 3]
         places = [self.plans[split].poses[index].T_R_T[:3, 3] for split, index in unvisited]
@@ -257,7 +258,7 @@ class Tour:
         """Return waypoints to a reference, rad or m, (n, k); None if there is no free path.
 
         The path goes by way of the previous reference (of the first one the last), or directly if
-        that cannot be reached.
+        that cannot be reached. ``index``: of the reference, from 0; q: where the arm is, (k,).
         """
         goals = [pose.solutions[0] for pose in self.plans[REFERENCE].poses]
         goal, previous = goals[index], goals[index - 1]
@@ -309,7 +310,8 @@ class Tour:
 
         Of a tour without an order all solutions of the pose are done then, else those of the
         route. A tour is resumed by calling this for all visits made so far, in their order. Raises
-        KeyError for a pose that is done already.
+        KeyError for a pose that is done already. ``split, index``: the pose's plan, and its index
+        there.
         """
         visit = self._visit(split, index, Route(ids, paths, unreached))
         if split == REFERENCE:
@@ -344,7 +346,10 @@ class Tour:
         return bool(self._unvisited.get(split))
 
     def _begin_reference(self, index: int) -> None:
-        """Count a visit to a reference; the last one ends the round."""
+        """Count a visit to a reference; the last one ends the round.
+
+        ``index``: of the reference, from 0.
+        """
         self.reference_visits += 1
         self._rounds_due = max(self._rounds_due, 1)
         self._reference = index + 1
@@ -478,7 +483,8 @@ def free_waypoints(
     """Return waypoints between q and goal (both excluded) of a free path, rad or m, (n, k).
 
     None if no path is found. ``model``: obstacles; with None the straight path is free, n = 0.
-    Repeatable: the same ends and seed give the same path.
+    Repeatable: the same ends and seed give the same path. ``velocity_limits``: per s, (k,);
+    ``seed``: of the search.
     """
     rng = np.random.default_rng([seed, *b'reference'])
     order, paths = free_order(model, q, goal[None], velocity_limits, rng)

@@ -47,7 +47,10 @@ def fastest_order(times: FloatArray) -> list[int]:
 
 
 def _nearest(times: FloatArray) -> list[int]:
-    """Return the nearest-neighbour order of all places, from place 0 on."""
+    """Return the nearest-neighbour order of all places, from place 0 on.
+
+    ``times``: between all places, s, (n, n).
+    """
     order, unvisited = [0], np.ones(len(times), bool)
     unvisited[0] = False
     while unvisited.any():
@@ -59,7 +62,8 @@ def _nearest(times: FloatArray) -> list[int]:
 def _reverse(times: FloatArray, order: list[int]) -> bool:
     """Reverse the part of the order that gains most, ends excepted; return whether any gains.
 
-    ``order``: changed in place; a gain counts from 1e-9 s on.
+    ``order``: changed in place; a gain counts from 1e-9 s on. ``times``: between all places, s,
+    (n, n).
     """
     at = np.array(order)
     # Times of the part from i to j: entry from i - 1, exit to j + 1.
@@ -79,7 +83,7 @@ def _move(times: FloatArray, order: list[int]) -> bool:
     """Move the part of the order that gains most; return whether any move gains.
 
     Up to `LONGEST_MOVED` places, also reversed; ends stay. ``order``: changed in place; a gain
-    counts from 1e-9 s on.
+    counts from 1e-9 s on. ``times``: between all places, s, (n, n).
     """
     best, move = 1e-9, None
     for size in range(1, LONGEST_MOVED + 1):
