@@ -45,9 +45,10 @@ def spline(
     end_velocity: FloatArray | None,
     duration: float,
 ) -> FloatArray:
-    """Coefficients, lowest power first, (n, k), of the piece between two waypoints.
+    """Coefficients, lowest power first, (2 or 4, k), of the piece between two waypoints.
 
-    Cubic (Hermite) if the end has a velocity, else linear.
+    In s from its start. Cubic (Hermite) if the end has a velocity, else linear, whatever the
+    velocity at the start. `duration`: s, above 0.
     """
     T, gap = duration, end - start
     if end_velocity is None:
@@ -63,8 +64,9 @@ def from_now(
     """Remaining part of a trajectory with a stamp, and its reference now (position, velocity).
 
     As in joint_trajectory_controller, points whose time has passed are dropped, and the reference
-    is between the two points around now. Without such a point it begins at the arm's position.
-    ``begins_s``: the stamp, s, None for now; ``points``: at times from the stamp.
+    is between the two points around now. The reference is None, for the arm's own position, if no
+    point has passed or all have; then no point remains. ``begins_s``: the stamp, s, None for now;
+    ``points``: at times from the stamp; the remaining ones are at times from now.
     """
     since_s = 0.0 if begins_s is None else now_s - begins_s
     remaining = [
@@ -85,7 +87,10 @@ def from_now(
 
 
 def _steady_response(reference: FloatArray) -> FloatArray:
-    """Polynomial particular solution of the servo equation for a polynomial reference."""
+    """Polynomial particular solution of the servo equation for a polynomial reference.
+
+    Coefficients, lowest power first, (powers, k), as those of the reference.
+    """
     w, z = NATURAL_FREQUENCY, DAMPING
     out = np.zeros_like(reference)
     for power in range(len(reference) - 1, -1, -1):
@@ -120,7 +125,7 @@ class _Response:
         return cls(start_s, steady, a, b)
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Position and velocity at time t."""
+        """Position and velocity, (k,) each, at world time t, s, from ``start_s`` on."""
         s = t - self.start_s
         decay = np.exp(-_DECAY * s)
         cosine, sine = decay * np.cos(_DAMPED * s), decay * np.sin(_DAMPED * s)
@@ -152,10 +157,9 @@ class Motion:
     ) -> None:
         """Follow a trajectory from `start_s` on, in the place of the present one.
 
+        ``waypoints``: at times from `start_s`, which increase; the last one is held.
         ``reference_now``: position and velocity of the trajectory at `start_s`, (k,) each; None if
-        it begins at the arm's position.
-
-        The last waypoint is held. One piece of response is kept for each piece of the reference.
+        it begins at the arm's position. Only the last 16 pieces of the motion are kept.
         """
         # A later trajectory replaces the future of the former one.
         self._responses = [r for r in self._responses if r.start_s <= start_s] or [
@@ -178,7 +182,10 @@ class Motion:
         del self._responses[:-16]
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad) and velocities (rad/s) at world time t, each (k,)."""
+        """Joint positions (rad) and velocities (rad/s) at world time t, each (k,).
+
+        Before the oldest kept piece: those at its beginning.
+        """
         for response in reversed(self._responses):
             if response.start_s <= t:
                 return response.at(t)

@@ -115,7 +115,7 @@ class LinkSide:
         self._states: deque[tuple[float, FloatArray, FloatArray]] = deque([still])
 
     def advance(self, motion: Motion, until_s: float) -> None:
-        """Follow a motion to a time, s."""
+        """Follow a motion to a time, s; nothing if that is past already."""
         count = int(np.ceil((until_s - self._done_s) / STEP_S - 1e-9))
         if count <= 0:
             return
@@ -145,7 +145,11 @@ class LinkSide:
             self._states.popleft()
 
     def at(self, motion: Motion, t: float) -> tuple[FloatArray, FloatArray]:
-        """Added joint angles, rad or m, (k,), and shift of the tool in R, m, (3,), at a time."""
+        """Added joint angles, rad or m, (k,), and shift of the tool in R, m, (3,), at a time, s.
+
+        Interpolated between steps; the motion is followed up to this time first. Of times over a
+        second ago: the oldest kept ones.
+        """
         self.advance(motion, t)
         after = next((i for i, state in enumerate(self._states) if state[0] >= t), -1)
         before_s, added, shift = self._states[max(after - 1, 0)]

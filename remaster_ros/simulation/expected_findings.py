@@ -17,7 +17,10 @@ Cause = tuple[str, tuple[int, ...], str]
 
 
 def causes(effect: HiddenEffect) -> list[Cause]:
-    """Causes that discovery has to name: one for each compliant joint, else one."""
+    """Causes that discovery has to name: one for each compliant joint, else one.
+
+    Joints count from 1; a coupled joint is followed by the one that drives it.
+    """
     if effect.kind == 'joint_compliance':
         return [(effect.kind, (joint,), '') for joint in effect.joints]
     if effect.kind == 'joint_coupling':
@@ -38,7 +41,11 @@ def _without_name(effect: HiddenEffect) -> Cause:
 
 
 def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
-    """Causes in an entry of the list ``effects`` of a discovery.json, one for each joint."""
+    """Causes in an entry of the list ``effects`` of a discovery.json, one for each joint.
+
+    One for all joints of a coupling or of an effect without a name. Only a sensor's effect has the
+    name of the sensor, else ''.
+    """
     name, joints = effect['name'], tuple(effect['joints'])
     if name not in NAMED:
         return [(name, joints, f'{effect["place"]} {effect["driver"]}')]
@@ -54,8 +61,8 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
 def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
     """Whether a found cause is the hidden one, which is a cause of the effect.
 
-    An effect without a name is found by any cause with the same place and driver, or with a name
-    that its kind accepts.
+    The joints must be equal in order. An effect without a name is found by any cause with the same
+    place and driver, or with a name that its kind accepts.
     """
     name, joints, detail = found
     if joints != hidden[1]:
@@ -68,7 +75,7 @@ def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
 
 
 def describe(cause: Cause) -> str:
-    """Cause in a few words."""
+    """Cause in a few words, such as ``backlash joint 4``."""
     name, joints, detail = cause
     where = f'joint {", ".join(map(str, joints))}' if joints else ''
     return ' '.join(part for part in (name, where, detail) if part)

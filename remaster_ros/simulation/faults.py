@@ -78,7 +78,11 @@ OF_TRACKER = {
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
-    """Write the faults of the World in `folder`, in place of the former ones; empty ends all."""
+    """Write the faults of the World in `folder`, in place of the former ones; empty ends all.
+
+    ``faults``: device -> fault -> its number. Raises InputError for a fault that the device has
+    not.
+    """
     for device, numbers in faults.items():
         known = OF_ROBOT if device == 'robot' else OF_OPTITRACK | OF_TRACKER
         for name in numbers:
@@ -101,7 +105,10 @@ class Faults:
         self._faults: Mapping[str, Numbers] = {}
 
     def of(self, device: str) -> Numbers:
-        """Faults of a device."""
+        """Present faults of a device, fault -> number; {} if it has none or there is no file.
+
+        The file is read again whenever it has changed.
+        """
         try:
             changed = self._path.stat().st_mtime_ns
         except OSError:
@@ -112,5 +119,8 @@ class Faults:
 
 
 def in_outage(period_s: float | None, t: float) -> bool:
-    """Whether a device that fails every other period fails at time t; never with None."""
+    """Whether a device that fails every other period fails at time t, s.
+
+    It works in the first period, from 0 on. Never with a period of None or 0.
+    """
     return bool(period_s) and int(t / period_s) % 2 == 1  # type: ignore[operator]

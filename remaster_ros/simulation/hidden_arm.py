@@ -51,7 +51,10 @@ class TrueArm:
         ]
 
     def move(self, start_s: float, start: FloatArray, end_s: float, end: FloatArray) -> None:
-        """Add a motion (rad, (k,)), in place of the rest of the last one."""
+        """Add a motion from `start` to `end` (reported, rad or m, (k,)), between two times, s.
+
+        It takes the place of the rest of the last one.
+        """
         before = self.deviation(start_s)
         self._stops[-1] = start
         self._stops.append(end)
@@ -63,7 +66,10 @@ class TrueArm:
             del self._stops[:-2], self._times[:-2]
 
     def deviation(self, t: float) -> Deviation:
-        """Deviation of arm and sensors at a time, one row."""
+        """Deviation of arm and sensors at a time, s, one row.
+
+        During a motion it passes smoothly from that before to that at its end.
+        """
         move = next((m for m in reversed(self._moves) if m[0] <= t), self._moves[0])
         start_s, end_s, before, after = move
         share = 1.0 if t >= end_s else (t - start_s) / (end_s - start_s)
@@ -71,7 +77,10 @@ class TrueArm:
         return before.map(lambda a, b: a + smooth * (b - a), after)
 
     def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
-        """Noise-free reading of a marker in the sensor's frame N, m, (3,), for reported q."""
+        """Noise-free reading of a marker in the sensor's frame N, m, (3,), for reported q, (k,).
+
+        `name`: of the sensor; `marker`: '' for the sensor's first; `t`: world time, s.
+        """
         sensor, wrong = self._truth.sensors[name], self.deviation(t)
         marker = marker or sensor.marker
         state = self._arm.state(q + self._truth.joint_offsets + wrong.angle)
@@ -106,7 +115,7 @@ class ChainArm:
         self.joints, self.slides = len(chain), chain.slides
 
     def state(self, q: FloatArray) -> ArmState:
-        """State of every joint for true joint angles q, rad, (n, k)."""
+        """State of every joint for true joint positions q, rad or m, (n, k)."""
         chain = self._chain
         frames = chain.frames(q)
         tool = frames[:, -1] @ chain.T_fixed[-1]
@@ -125,11 +134,14 @@ class ChainArm:
         )
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:
-        """Gravity's torque about each joint, in its positive direction, N m, (n, k)."""
+        """Gravity's torque about each joint, in its positive direction, N m, (n, k).
+
+        The force along it, N, for a joint that slides.
+        """
         return self._chain.gravity_torque(q, GRAVITY)
 
     def base_moment(self, q: FloatArray) -> FloatArray:
-        """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
+        """Moment of the moving links' weight about the base's origin, in R, N m, (n, 3)."""
         centers = apply(self._chain.frames(q), self._chain.centers_of_mass)
         moment = np.sum(self._chain.masses[:, None] * centers, axis=1)
         return np.cross(moment, np.array(GRAVITY))
@@ -147,7 +159,10 @@ class ChainArm:
         return moments
 
     def segments(self) -> FloatArray:
-        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3)."""
+        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3).
+
+        Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
+        """
         return self._chain.T_fixed[:, :3, 3]
 
 
@@ -165,7 +180,10 @@ def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: 
 
 
 def model_of_tour(chain: SerialChain, truth: SessionTruth, q: FloatArray) -> WorldModel:
-    """True arm on a tour through the configurations q, rad, (m, k), in that order."""
+    """True arm on a tour through the configurations q, rad or m, (m, k), in that order.
+
+    It begins at the first one; a configuration takes 10 s (`SECONDS_PER_CONFIGURATION`).
+    """
     time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q), dtype=float)
     visited = Round(q, q[0], time_s, truth.warming.at(truth.warming.start_s + time_s))
     return WorldModel(ChainArm(chain), visited, truth.sensors, truth.markers, truth.joint_offsets)

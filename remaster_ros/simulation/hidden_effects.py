@@ -85,14 +85,14 @@ class Deviation:
     def none(
         cls, n: int, k: int, sensors: tuple[str, ...] = (), markers: tuple[str, ...] = ()
     ) -> Deviation:
-        """Arm and sensors as drawn."""
+        """Zero deviation at n configurations of k joints: arm and sensors as drawn."""
         s = len(sensors)
         shapes = ((k,), (k + 1, 3), (k, 3), (3,), (len(markers), 3))
         per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 2), (s, 3), (s, 2))
         return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
     def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
-        """Function applied to every array of this and other deviations."""
+        """Deviation with a function applied to each array of this one and those of `others`."""
         names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
         changed: dict[str, Any] = {
             name: change(getattr(self, name), *(getattr(other, name) for other in others))
@@ -101,7 +101,10 @@ class Deviation:
         return replace(self, **changed)
 
     def measured(self, sensor: str, points: FloatArray) -> FloatArray:
-        """Readings of a sensor for points p in its frame N, m, (n, 3)."""
+        """Readings of a sensor, by its name, for true points p in its frame N, m, (n, 3).
+
+        Raises ValueError for an unknown sensor.
+        """
         s = self.sensors.index(sensor)
         across = points * (1.0, 1.0, 0.0)
         across[:, :2] -= self.center[:, s]
@@ -130,10 +133,11 @@ class HiddenEffect:
     detail: Mapping[str, Any] = field(default_factory=dict)
 
     def scaled(self, factor: float) -> HiddenEffect:
-        """Same effect, larger by a factor."""
+        """Same effect with all values multiplied by a factor."""
         return replace(self, values=factor * self.values)
 
     def __str__(self) -> str:
+        """Kind, joints, values in SI units and details, but for arrays, in one line."""
         shown = {key: value for key, value in self.detail.items() if np.ndim(value) < 1}
         detail = ''.join(f', {key} {value}' for key, value in shown.items())
         values = ' '.join(f'{value:.3g}' for value in self.values)
@@ -156,7 +160,7 @@ class DrawContext:
         return tuple(self.distance_m)
 
     def joint(self, first: int = 1) -> tuple[int]:
-        """Random joint number, from 1."""
+        """Random joint number, from `first` to that of the last joint, as a tuple of one."""
         return (int(self.rng.integers(first, self.joints + 1)),)
 
     def sign(self) -> float:
@@ -164,7 +168,7 @@ class DrawContext:
         return float(self.rng.choice((-1.0, 1.0)))
 
     def direction(self, size: int) -> FloatArray:
-        """Random unit vector."""
+        """Random unit vector, uniform over directions, (size,)."""
         values = self.rng.standard_normal(size)
         return values / np.linalg.norm(values)
 
@@ -174,7 +178,10 @@ Draw = Callable[[str, DrawContext], HiddenEffect]
 
 
 def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
-    """Draw of a joint and a sign; no sign if physics has only the positive one."""
+    """Draw of a joint, from `first_joint` (from 1) on, and a sign; the value is ±`largest`.
+
+    No sign if ``positive``: physics has only the positive one.
+    """
     return lambda kind, context: HiddenEffect(
         kind,
         context.joint(first_joint),
@@ -183,12 +190,15 @@ def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> D
 
 
 def no_joint(largest: float) -> Draw:
-    """Draw of an effect with one value and the sign of physics, without randomness."""
+    """Draw of an effect of no joint with the value `largest`, without randomness."""
     return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
 
 
 def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of a sensor's effect: a form, and `size` values, `largest` times a unit vector."""
+    """Draw of a sensor's effect: a form, and `size` values, `largest` times a unit vector.
+
+    Sensor and form, one of `forms`, are random and in the effect's detail.
+    """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         detail = {
@@ -201,7 +211,11 @@ def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> 
 
 
 def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of an effect of two joints: the joint with the error, and another that it follows."""
+    """Draw of an effect of two joints: the joint with the error, and another that it follows.
+
+    The other one is ``by`` in the detail, a random one of `forms` is ``form``: two values for
+    'sin/cos', else one; `largest` times a unit vector.
+    """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         joint, by = (int(j) for j in 1 + context.rng.choice(context.joints, 2, replace=False))
@@ -213,7 +227,10 @@ def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
 
 
 def at_some_time(draw: Draw) -> Draw:
-    """Draw with a random moment from which the effect is present."""
+    """Draw with a random moment from which the effect is present, ``moment_s`` in the detail.
+
+    Uniform over 15 to 85 % of the visits' time.
+    """
 
     def timed(kind: str, context: DrawContext) -> HiddenEffect:
         effect = draw(kind, context)
@@ -242,7 +259,7 @@ class Part:
     def of(self, effect: HiddenEffect) -> dict[str, float]:
         """Name and true value, SI units, for an effect of one joint and one order.
 
-        {} if it does not apply.
+        {} if it does not apply: other details, or a value of 0.
         """
         if any(effect.detail.get(key) != value for key, value in self.detail.items()):
             return {}
@@ -277,7 +294,8 @@ class HiddenKind:
 def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
     """Effect, drawn in rad, in the units of its joints; None if such joints cannot have it.
 
-    ``per_radian``: equivalent of a radian in each joint's unit, (k,).
+    ``per_radian``: equivalent of a radian in each joint's unit, (k,). Effects elsewhere than in a
+    joint's angle stay as they are.
     """
     kind = KINDS[effect.kind]
     by = effect.detail.get('by')
@@ -353,22 +371,28 @@ def _draw_tilt(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_marker(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw an offset of the markers by 10 mm in a random direction."""
     return HiddenEffect(kind, (), 10e-3 * context.direction(3))
 
 
 def _draw_bump(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a shift of a random sensor by 3 mm and a turn by 1.5 mrad, in random directions."""
     # A turn about the sensor moves a marker two metres away about as far as the shift does.
     values = np.concatenate((3e-3 * context.direction(3), 1.5e-3 * context.direction(3)))
     return HiddenEffect(kind, (), values, {'sensor': str(context.rng.choice(context.sensors))})
 
 
 def _draw_marker_slip(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a shift of a random marker by 3 mm in a random direction."""
     marker = str(context.rng.choice(context.markers))
     return HiddenEffect(kind, (), 3e-3 * context.direction(3), {'marker': marker})
 
 
 def _about_mean_distance(largest: float) -> Draw:
-    """Draw a sensor and a sign."""
+    """Draw of a sensor and a sign; the value is ±`largest`.
+
+    The mean distance of the sensor's markers is ``distance_m`` in the detail.
+    """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         sensor = str(context.rng.choice(context.sensors))
@@ -383,6 +407,7 @@ WAVES = (Part('sin{order}_{j}', (1.0, 0.0)), Part('cos{order}_{j}', (0.0, 1.0)))
 
 
 def _along_axes(name: str) -> tuple[Part, ...]:
+    """Parameters along x, y and z; `name` has ``{axis}`` for the letter."""
     units = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return tuple(Part(name.format(axis=axis), unit) for axis, unit in zip('xyz', units))
 
@@ -406,7 +431,10 @@ def _kind(
     name: str = '',
     power: int | None = 0,
 ) -> Callable[[Rule], Rule]:
-    """Decorator that enters the kind of a rule into a table, by the rule's name or another one."""
+    """Decorator that enters the kind of a rule into a table, by the rule's name or `name`.
+
+    Other arguments: as the fields of `HiddenKind`; `answers` are its ``accepted``.
+    """
 
     def take(rule: Rule) -> Rule:
         table[name or rule.__name__] = HiddenKind(place, driver, rule, draw, parts, power, answers)
@@ -420,20 +448,24 @@ _of_slides = partial(_kind, OF_SLIDES)
 
 
 def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
+    """1 at configurations after the effect's ``moment_s``, else 0, (n,)."""
     return (c.time_s > e.detail['moment_s']).astype(float)
 
 
 # A torque is a force at a lever: its unit is in it once more.
 @_named('joint_angle', 'gravity_torque', _draw_compliance, Part('compliance_{j}'), power=-1)
 def joint_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = values_j τ_j for each of the joints, rad/(N m)."""
+    """δq_j = values_j τ_j, added to ``d.angle``, for each of the joints, rad/(N m)."""
     for value, j in zip(e.values, e.joints, strict=True):
         d.angle[:, j - 1] += value * c.torque[:, j - 1]
 
 
 @_named('joint_angle', 'joint_angle', _draw_eccentricity, *WAVES, power=None)
 def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Per order o in detail: δq = a sin(o q) + b cos(o q), rad."""
+    """Per order o in detail: δq = a sin(o q) + b cos(o q), rad, added to ``d.angle``.
+
+    Values: a and b of each order, in turn.
+    """
     q = c.q[:, e.joints[0] - 1]
     for order, (a, b) in zip(e.detail['orders'], e.values.reshape(-1, 2), strict=True):
         d.angle[:, e.joints[0] - 1] += a * np.sin(order * q) + b * np.cos(order * q)
@@ -441,7 +473,7 @@ def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 
 @_named('joint_angle', 'joint_angle', one_value(5e-3), Part('scale_{j}'), power=1)
 def encoder_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = s q."""
+    """δq = s q, added to ``d.angle`` of the joint; s: the only value."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.joints[0] - 1]
 
 
@@ -452,7 +484,10 @@ _named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic', p
 
 @_named('joint_angle', 'joint_angle', _draw_curve)
 def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = sum of waves of many orders, none of them slow enough for an eccentricity."""
+    """δq = sum of waves of many orders, none of them slow enough for an eccentricity.
+
+    Added to ``d.angle``; the value, rad, times amplitudes a of the detail: a cos(o q + phase).
+    """
     q = (c.q / c.per_radian)[:, e.joints[0] - 1]
     waves = sum(
         a * np.cos(order * q + phase)
@@ -470,13 +505,16 @@ def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('half_backlash_{j}', (2.0,)),
 )
 def backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = ½ B sign(last move of the joint)."""
+    """δq = ½ B sign(last move of the joint), added to ``d.angle``; B, rad, is the only value."""
     d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
 
 
 @_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'), power=1)
 def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = −s (q − q before the move): the arm has not reached its target yet."""
+    """δq = −s (q − q before the move): the arm has not reached its target yet.
+
+    Added to ``d.angle``; s, a share, is the only value.
+    """
     d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
 
 
@@ -490,7 +528,11 @@ def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     power=1,
 )
 def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i, or a sin q_i + b cos q_i."""
+    """δq_j = s q_i, or a sin q_i + b cos q_i, added to ``d.angle`` of joint j.
+
+    Joint i is ``by`` in the detail, whose ``form`` is 'linear' or 'sin/cos'; values: s, or a and
+    b.
+    """
     other = c.q[:, e.detail['by'] - 1]
     if e.detail['form'] == 'linear':
         d.angle[:, e.joints[0] - 1] += e.values[0] * other
@@ -506,7 +548,10 @@ def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
 )
 def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = shift of the next joint along the link after joint j, or along an axis of it, m."""
+    """δ = shift of the next joint along the link after joint j, or along an axis of it, m.
+
+    Added to ``d.shift``. The detail's ``axis`` is 'along', 'x', 'y' or 'z'.
+    """
     j = e.joints[0]
     axis = e.detail.get('axis', 'along')
     along = c.segments[j] if axis == 'along' else np.eye(3)['xyz'.index(axis)]
@@ -515,25 +560,28 @@ def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('link_rotation', 'constant', _draw_tilt, *_along_axes('tilt_{axis}_{{j}}'))
 def joint_axis_tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of joint j's frame about its x, y, z before its own rotation, rad."""
+    """Rotation of joint j's frame about its x, y, z before its own rotation, rad.
+
+    The three values are added to ``d.tilt``.
+    """
     d.tilt[:, e.joints[0] - 1] += e.values
 
 
 @_named('marker', 'constant', _draw_marker)
 def marker_offset(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Offset of the markers from the drawing, m along x, y, z of the tool."""
+    """Offset of all markers from the drawing, m along x, y, z of the tool, in ``d.marker``."""
     d.marker += e.values
 
 
 @_named('link_translation', 'temperature', no_joint(2e-4), Part('growth'))
 def thermal_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Growth of every segment by α ΔT of its length, 1/K."""
+    """Growth of every segment by α ΔT of its length, added to ``d.shift``; α, 1/K: the value."""
     d.shift += e.values[0] * c.warming_k[:, None, None] * c.segments
 
 
 @_named('base_rotation', 'gravity_moment', no_joint(1e-4), Part('base_compliance'))
 def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of the base per moment of weight about x and y, rad/(N m)."""
+    """Rotation of the base per moment of weight about x and y, rad/(N m), added to ``d.base``."""
     d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
 
 
@@ -553,7 +601,10 @@ def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw a rocking of the base by 2 mrad about a horizontal axis beyond a moment, N m."""
+    """Draw a rocking of the base by 2 mrad about a horizontal axis beyond a moment, N m.
+
+    The moment about the axis exceeds it at a quarter to three quarters of the visits.
+    """
     angle = context.rng.uniform(0.0, np.pi)
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
     moment = np.quantile(context.circumstances.base_moment @ axis, context.rng.uniform(0.25, 0.75))
@@ -562,14 +613,21 @@ def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
 
 @_named('base_rotation', 'gravity_moment', _draw_rocking, Part('base_tipping'))
 def base_tipping(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of the base, rad, from one side to the other if a moment exceeds a value."""
+    """Rotation of the base, rad, from one side to the other if a moment exceeds a value.
+
+    By half the value about the detail's ``axis``, minus that below the ``moment``, N m; added to
+    ``d.base``.
+    """
     leans = c.base_moment @ e.detail['axis'] > e.detail['moment']
     d.base += e.values[0] * np.where(leans, 0.5, -0.5)[:, None] * e.detail['axis']
 
 
 @_named('sensor_frame', 'time', of_sensor(1e-6, 3), *_along_axes('drift_{axis}_{{sensor}}'))
 def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Drift of the sensor's readings with this velocity, m/s, in its own frame."""
+    """Drift of the sensor's readings with this velocity, m/s, in its own frame.
+
+    Times the time since the first measurement, added to ``d.sensor_shift``.
+    """
     d.sensor_shift[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
 
 
@@ -581,14 +639,17 @@ def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('scale_{sensor}', detail={'form': 'all'}),
 )
 def sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = s p, or only in depth (z of N)."""
+    """δp = s p, or only in depth (z of N).
+
+    Added to ``d.scale``; the detail's ``form`` is 'all' or 'depth'.
+    """
     along = np.array([0.0, 0.0, 1.0]) if e.detail['form'] == 'depth' else np.ones(3)
     d.scale[:, d.sensors.index(e.detail['sensor'])] += e.values[0] * along
 
 
 @_named('sensor_frame', 'position', of_sensor(0.2), Part('radial_{sensor}'))
 def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²."""
+    """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²; in ``d.radial``."""
     d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
 
 
@@ -600,13 +661,16 @@ def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     power=-1,
 )
 def foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s τ_i: joint j yields to another joint's torque."""
+    """δq_j = s τ_i: joint j yields to another joint's torque; s in rad/(N m).
+
+    Added to ``d.angle``; joint i is ``by`` in the detail.
+    """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
 
 
 @_unnamed('joint_angle', 'time', one_value(1e-6, 2), Part('joint_{j}_by_time'))
 def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s t."""
+    """δq_j = s t, added to ``d.angle``; s in rad/s."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.time_s
 
 
@@ -614,32 +678,41 @@ def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     'joint_angle', 'time', at_some_time(one_value(15 * ARC_MINUTE, 2)), Part('joint_{j}_step')
 )
 def slipped_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s from a moment on."""
+    """δq_j = s from a moment (``moment_s`` in the detail) on, rad, added to ``d.angle``."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
 
 
 @_unnamed('joint_angle', 'temperature', one_value(5e-4, 2), Part('joint_{j}_by_temperature'))
 def warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s ΔT."""
+    """δq_j = s ΔT, added to ``d.angle``; s in rad/K."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
 
 
 @_unnamed('joint_angle', 'angle', two_joints(3e-3), power=2)
 def bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i²: neither a line nor a wave of the other joint."""
+    """δq_j = s q_i²: neither a line nor a wave of the other joint.
+
+    Added to ``d.angle``; joint i is ``by`` in the detail.
+    """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2
 
 
 @_unnamed('marker', 'gravity', no_joint(3e-3))
 def sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = s (gravity's direction across the tool's z axis): the marker's stem bends."""
+    """δ = s (gravity's direction across the tool's z axis): the marker's stem bends.
+
+    In m, added to ``d.marker`` of all markers.
+    """
     down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
     d.marker += e.values[0] * (down * (1.0, 1.0, 0.0))[:, None]
 
 
 @_unnamed('sensor_frame', 'time', at_some_time(_draw_bump))
 def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = v + w × p from a moment on, values (v m, w rad): the sensor was moved."""
+    """δp = v + w × p from a moment on, values (v m, w rad): the sensor was moved.
+
+    Added to ``d.sensor_shift`` and ``d.turn``; the moment is ``moment_s`` in the detail.
+    """
     s, after = d.sensors.index(e.detail['sensor']), _after(e, c)[:, None]
     d.sensor_shift[:, s] += after * e.values[:3]
     d.turn[:, s] += after * e.values[3:]
@@ -653,7 +726,10 @@ def slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_unnamed('sensor_frame', 'position', _about_mean_distance(0.05), answers=('sensor_distortion',))
 def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = k (|p|/D − 1)² along the line of sight: zero near the mean distance D."""
+    """δ = k (|p|/D − 1)² along the line of sight, k in m: zero near the mean distance D.
+
+    D is ``distance_m`` in the detail. Added to ``d.along`` and ``d.scale``.
+    """
     s, k, mean = d.sensors.index(e.detail['sensor']), e.values[0], e.detail['distance_m']
     d.along[:, s, 0] += k
     d.scale[:, s] -= 2.0 * k / mean
@@ -668,7 +744,10 @@ def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     answers=('sensor_distortion', 'sensor_scale'),
 )
 def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k ((|p|/D)² − 1) p: zero at the mean distance D only."""
+    """δp = k ((|p|/D)² − 1) p: zero at the mean distance D only.
+
+    D is ``distance_m`` in the detail. Added to ``d.along`` and ``d.scale``.
+    """
     s = d.sensors.index(e.detail['sensor'])
     d.along[:, s, 2] += e.values[0] / e.detail['distance_m'] ** 2
     d.scale[:, s] -= e.values[0]
@@ -676,31 +755,40 @@ def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 
 @_unnamed('sensor_frame', 'position', of_sensor(0.05, 2), answers=('sensor_distortion',))
 def one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = z u² k, where u = (x, y)/z along k = values is positive, else zero."""
+    """δp = z u² k, where u = (x, y)/z along k = values is positive, else zero; in ``d.half``."""
     d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
 
 
 def _draw_off_centre(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a distortion as of `of_sensor`, 0.2 1/m², about a center 0.3 m beside the axis."""
     effect = of_sensor(0.2)(kind, context)
     return replace(effect, detail={**effect.detail, 'center': 0.3 * context.direction(2)})
 
 
 @_unnamed('sensor_frame', 'position', _draw_off_centre, answers=('sensor_distortion',))
 def off_centre_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k |p − c|² (p − c) across the axis z, c not on it."""
+    """δp = k |p − c|² (p − c) across the axis z, c not on it; k in 1/m².
+
+    Added to ``d.radial`` and ``d.center``; c, m, is ``center`` in the detail.
+    """
     s = d.sensors.index(e.detail['sensor'])
     d.radial[:, s] += e.values[0]
     d.center[:, s] += e.detail['center']
 
 
 def _draw_lagging(kind: str, context: DrawContext) -> HiddenEffect:
+    """Draw a growth of 2e-4 1/K that follows the temperature with a lag of 900 to 4500 s."""
     lag = float(context.rng.uniform(900.0, 4500.0))
     return HiddenEffect(kind, (), np.array([2e-4]), {'lag_s': lag})
 
 
 @_unnamed('link_translation', 'temperature', _draw_lagging, answers=('thermal_growth',))
 def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Growth of every segment by α of its length per K of a delayed temperature, 1/K."""
+    """Growth of every segment by α of its length per K of a delayed temperature, 1/K.
+
+    Added to ``d.shift``. The delay is of first order with the time constant ``lag_s`` of the
+    detail.
+    """
     # The thermometer's temperature is a line between two configurations.
     tau, slow = e.detail['lag_s'], np.zeros(len(c.time_s))
     for i in range(1, len(slow)):
@@ -712,7 +800,10 @@ def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_guide(largest: float) -> Draw:
-    """Draw a wave of one half to one and a half periods along a slide, 0 if nothing slides."""
+    """Draw of a wave of one half to one and a half periods along a random slide.
+
+    Its value is `largest`, its axis across the slide; 0 at joint 1 if nothing slides.
+    """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
         c, rng = context.circumstances, context.rng
@@ -730,19 +821,23 @@ def _draw_guide(largest: float) -> Draw:
 
 
 def _along_guide(e: HiddenEffect, c: Circumstances) -> FloatArray:
+    """Wave of the place of a slide, along the effect's axis, m or rad, (n, 3)."""
     wave = np.sin(e.detail['per_m'] * c.q[:, e.joints[0] - 1] + e.detail['phase'])
     return e.values[0] * wave[:, None] * e.detail['axis']
 
 
 @_of_slides('link_translation', 'own_place', _draw_guide(2e-3), answers=('guide_straightness',))
 def crooked_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Shift of the carriage of joint j across its way, a wave of its place, m."""
+    """Shift of the carriage of joint j across its way, a wave of its place, m, in ``d.shift``."""
     d.shift[:, e.joints[0]] += _along_guide(e, c)
 
 
 @_of_slides('link_rotation', 'own_place', _draw_guide(2e-3), answers=('guide_pitch',))
 def pitching_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Turn of the carriage of joint j about an axis across its way, a wave of its place, rad."""
+    """Turn of the carriage of joint j about an axis across its way, a wave of its place, rad.
+
+    Added to ``d.tilt``, and to ``d.shift`` so that the carriage stays in its place.
+    """
     j, turn = e.joints[0], _along_guide(e, c)
     d.tilt[:, j - 1] += turn
     # That turns the way about its zero; the carriage stays where it is.
@@ -753,7 +848,7 @@ KINDS = NAMED | UNNAMED | OF_SLIDES
 
 
 def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:
-    """Add the contribution of an effect, in its circumstances, to a deviation."""
+    """Add the contribution of an effect, in its circumstances, to a deviation, in place."""
     KINDS[effect.kind].rule(effect, deviation, c)
 
 
@@ -772,7 +867,7 @@ def true_parameters(effect: HiddenEffect) -> dict[str, float]:
 
 
 def _each(effect: HiddenEffect) -> list[HiddenEffect]:
-    """The effect separately for each joint, a wave separately for each order."""
+    """The effect separately for each joint, a wave separately for each order; else [effect]."""
     if len(effect.joints) > 1:
         return [
             replace(effect, joints=(joint,), values=np.array([value]))

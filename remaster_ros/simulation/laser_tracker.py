@@ -103,7 +103,12 @@ class TrackerBehaviour:
 
 
 def refusal(command: Command, values: tuple[Value, ...]) -> Status:
-    """Status with the reason why a setting is refused, or `Status.ALL_OK`."""
+    """Status with the reason why a setting is refused, or `Status.ALL_OK`.
+
+    Refused are values that are not finite, other units than those of `LENGTH_UNITS_M` with 0 for
+    angles, temperature and humidity, modes other than 0, unknown reflectors, and air or search
+    values out of range.
+    """
     numbers = np.array(values, float)
     if not np.all(np.isfinite(numbers)):
         return Status.INVALID_INPUT_DATA
@@ -173,11 +178,14 @@ class Beam:
         self._move_judged = False
 
     def reflector(self, t: float) -> FloatArray:
-        """True position of the present reflector at time t, m, (3,)."""
+        """True position of the present reflector at time t, s, m in the tracker's frame, (3,)."""
         return self._world.marker_in_sensor(self._sensor, t, self._on)
 
     def sees(self, t: float) -> bool:
-        """Whether the line of sight to the present reflector is free at time t."""
+        """Whether the line of sight to the present reflector is free at time t, s.
+
+        False also with the fault ``hidden`` of this reflector's number.
+        """
         if self._world.faults(self._sensor).get('hidden') == self._numbers[self._on]:
             return False
         return self._world.line_of_sight(self._sensor, t, self._on)
@@ -185,7 +193,8 @@ class Beam:
     def find(self, target: FloatArray, largest_rad: float, t: float) -> bool:
         """Select the visible reflector nearest to a direction; False if none is near enough.
 
-        ``largest_rad``: largest angle from the direction.
+        ``target``: in the tracker's frame, of any length but 0, (3,); ``largest_rad``: largest
+        angle from it. The beam is not locked; without a reflector the former one stays selected.
         """
         before, near = self._on, {}
         for name in self._numbers:
@@ -197,12 +206,17 @@ class Beam:
         return bool(near)
 
     def lock(self, t: float) -> None:
-        """Lock on the reflector that was found, at time t."""
+        """Lock on the selected reflector and aim at it, at time t, s."""
         self.locked, self.aim, self._sight_at = True, self.reflector(t), t
         self._swept_rad, self._move_judged = 0.0, False
 
     def follow(self, t: float) -> bool:
-        """Follow the reflector for a step that ends at time t; False if the beam loses it."""
+        """Follow the reflector for a step that ends at time t, s; False if the beam loses it.
+
+        It does if the reflector is hidden (looked up at every step while the arm moves, else every
+        0.5 s), outruns it, or a large move shakes it. The aim stays where it was lost. Meant for a
+        locked beam.
+        """
         reflector, moving = self.reflector(t), self._world.is_moving(t)
         across_speed = angle_between(self.aim, reflector) * np.linalg.norm(reflector) / STEP_S
         # The line of sight takes long to compute, and changes little while the arm stands still.
@@ -229,7 +243,7 @@ class Beam:
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> float:
-    """Angle between two directions, rad; exact for small ones too."""
+    """Angle between two directions (3,), rad, 0 to π; exact for small ones too."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
@@ -328,7 +342,7 @@ class TrackerInstrument:
 
     @property
     def readiness(self) -> Readiness:
-        """Not ready, busy or ready, as the instrument reports it."""
+        """Busy during an operation, else ready if the beam is locked, else not ready."""
         if self._operation is not None:
             return Readiness.BUSY
         return Readiness.READY if self.locked else Readiness.NOT_READY
@@ -338,7 +352,10 @@ class TrackerInstrument:
         return [self._readiness_change()]
 
     def handle(self, request: Request) -> list[Event]:
-        """Handle a command at the time of the last step; the immediate answers are returned."""
+        """Handle a command at the time of the last step; the immediate answers are returned.
+
+        An unknown command is answered by NOT_IMPLEMENTED.
+        """
         command = request.command
         if command in SETTINGS:
             self._set(command, request.values)
@@ -352,7 +369,10 @@ class TrackerInstrument:
         return self._sent()
 
     def step(self, t: float) -> list[Event]:
-        """Advance to world time t; the packets sent meanwhile are returned."""
+        """Advance to world time t, s, in steps of 0.1 s; the packets sent meanwhile are returned.
+
+        Of a delay only the last 5 s are made up for.
+        """
         self._time = max(self._time, t - _LONGEST_CATCH_UP_S)
         while t - self._time >= STEP_S:
             self._time += STEP_S
@@ -362,21 +382,23 @@ class TrackerInstrument:
         return self._sent()
 
     def abort(self) -> None:
-        """End the present command, as when the client disconnects."""
+        """End the present command, as when the client disconnects; nothing without one."""
         if self._operation is not None:
             self._operation = None
             self._out.append(self._readiness_change())
 
     def break_beam(self) -> list[Event]:
-        """Lose the reflector, as when a person walks through the beam."""
+        """Lose the reflector, as when a person walks through the beam; the packets to send."""
         self._lose()
         return self._sent()
 
     def _sent(self) -> list[Event]:
+        """Packets that were to be sent, in order; they are forgotten here."""
         out, self._out = self._out, []
         return out
 
     def _reply(self, command: Command, status: int = 0, values: tuple[Value, ...] = ()) -> None:
+        """Put a reply to a command among the packets to be sent."""
         self._out.append(Reply(command, status, values))
 
     def _readiness_change(self) -> StatusChange:
@@ -388,6 +410,7 @@ class TrackerInstrument:
 
     @property
     def _unit_m(self) -> float:
+        """Unit of length that the client has set, m."""
         return LENGTH_UNITS_M[int(self._settings[Command.GET_UNITS][0])]
 
     def _set(self, command: Command, values: tuple[Value, ...]) -> None:
@@ -406,7 +429,7 @@ class TrackerInstrument:
             self._out.append(StatusChange(setting.change))
 
     def _convert_lengths(self, unit: int) -> None:
-        """Convert the search radius to a new unit."""
+        """Convert the search radius to a new unit, an index of `LENGTH_UNITS_M`."""
         radius, timeout = self._settings[Command.GET_SEARCH]
         scale = self._unit_m / LENGTH_UNITS_M[unit]
         self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
@@ -444,7 +467,11 @@ class TrackerInstrument:
         self._advance()
 
     def _start(self, command: Command, values: tuple[Value, ...]) -> Operation:
-        """Operation of a command that takes time."""
+        """Operation of a command that takes time: measurement, initialisation or a search.
+
+        A search begins at the present aim (FIND_REFLECTOR, with a distance) or at a position
+        (GO_POSITION), in the client's unit of length.
+        """
         if command is Command.START_MEASUREMENT:
             return self._measure()
         if command is Command.INITIALIZE:
@@ -506,9 +533,10 @@ class TrackerInstrument:
         self._beam.aim = target
 
     def _search(self, command: Command, target: FloatArray, distance: float) -> Operation:
-        """Turn to the target and search in a spiral about it.
+        """Turn to the target and search in a spiral about it; lock on what is found, and reply.
 
-        A spiral of pitch p at speed v reaches the radius r after π r² / (p v).
+        A spiral of pitch p at speed v reaches the radius r after π r² / (p v). It ends at the
+        radius or time of the settings. ``target``: m, (3,); ``distance``: of the reflector, m.
         """
         b = self.behaviour
         search_radius, timeout_ms = self._settings[Command.GET_SEARCH]
@@ -530,7 +558,10 @@ class TrackerInstrument:
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
-        """Measurement as an operation: a result, or an error if beam breaks or target moves."""
+        """Measurement as an operation: a result, or an error if beam breaks or target moves.
+
+        The target moves if it leaves 50 µm (``stability_limit_m``) about its first place.
+        """
         integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
         samples = [self._beam.reflector(self._time)]
@@ -626,7 +657,7 @@ class FakeLaserTracker:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port of the listening socket."""
+        """Host and port of the listening socket. Raises RuntimeError before `start`."""
         if self._listener is None:
             raise RuntimeError('the fake laser tracker has not been started')
         return self._listener.getsockname()[:2]
@@ -653,7 +684,7 @@ class FakeLaserTracker:
         self._thread.start()
 
     def close(self) -> None:
-        """Switch off: stop the thread and close every socket."""
+        """Switch off: stop the thread and close every socket; may be repeated."""
         self._closing.set()
         if self._thread is not None:
             self._thread.join()
@@ -664,7 +695,7 @@ class FakeLaserTracker:
             self._listener = None
 
     def break_beam(self) -> None:
-        """Interrupt the beam, as a person who walks through it does."""
+        """Interrupt the beam, as a person who walks through it does, and tell the client."""
         with self._lock:
             self._send(self._instrument.break_beam())
 
@@ -688,14 +719,18 @@ class FakeLaserTracker:
         self._drop_client()
 
     def _instrument_time(self, faults: Numbers) -> float:
-        """World time, slower for an instrument with the fault ``slow``."""
+        """World time, s, slower for an instrument with the fault ``slow``: its loss remains."""
         now = self._world.now()
         passed, self._looked_at = now - self._looked_at, now
         self._lost_s += passed * (1.0 - 1.0 / faults.get('slow', 1.0))
         return now - self._lost_s
 
     def _apply(self, faults: Numbers) -> None:
-        """Apply the injected faults of the connection and the power."""
+        """Apply the injected faults of the connection and the power.
+
+        'off' drops the client, 'renumbered' switches the instrument off and on once, 'garbage'
+        sends 64 random bytes.
+        """
         if 'off' in faults:
             self._drop_client()
         if 'renumbered' in faults and not self._restarted:

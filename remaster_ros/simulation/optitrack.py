@@ -62,7 +62,11 @@ class FrameFaults:
         self._begins_at: Frame | None = None
 
     def spoil(self, frame: Frame, faults: Numbers) -> Iterator[Frame | bytes]:
-        """Frames or raw bytes that are sent in place of a frame."""
+        """Yield the frames or raw bytes that are sent in place of a frame, which may be none.
+
+        ``faults``: as in `faults.OF_OPTITRACK`. Frames are kept for later calls by 'late',
+        'reordered', 'frozen' and 'renumbered'.
+        """
         if 'frozen' not in faults:
             self._frozen = None
         elif self._frozen is None:
@@ -187,7 +191,7 @@ class OptiTrackScene:
 
     @property
     def model(self) -> ModelDefinition:
-        """Rigid body and its marker sets."""
+        """Rigid body, with marker positions about their mean, m, and its marker sets."""
         behaviour = self._behaviour
         names = tuple(f'{behaviour.rigid_body}_{i + 1}' for i in range(len(self._offsets)))
         body = RigidBodyDescription(
@@ -206,9 +210,10 @@ class OptiTrackScene:
         )
 
     def frame(self, number: int, version: Version, t: float | None = None) -> Frame:
-        """Frame of the world now, or at time t, s.
+        """Frame of the world now, or sent at time t, s.
 
-        ``version``: bitstream of the server: NatNet 2 has fewer flags and no residual.
+        ``number``: of the frame; ``version``: bitstream of the server: NatNet 2 has fewer flags
+        and no residual. With a camera's timing it shows the world before it is sent.
         """
         behaviour, size = self._behaviour, len(self._offsets)
         sent_s = self._world.now() if t is None else t
@@ -272,7 +277,7 @@ class OptiTrackScene:
         )
 
     def ticks(self, t: float) -> int:
-        """Server's fine clock at world time t; it began earlier, as on a real host."""
+        """Server's fine clock at world time t, s; it began 1000 s earlier, as on a real host."""
         return round((self._by_its_clock(t) + 1000.0) * CLOCK_HZ)
 
     def _by_its_clock(self, t: float) -> float:
@@ -281,7 +286,11 @@ class OptiTrackScene:
         return (t - self._start_s) * (1.0 if timing is None else 1.0 + timing.drift)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
-        """Flags of the hidden marker; None while all are visible."""
+        """Flags of the hidden marker at world time t, s; None while all are visible.
+
+        ``tracked``: whether the line of sight is free. Occlusions are planned here, and their
+        flags and guessed errors drawn.
+        """
         start, end = self._occlusion
         if t >= end:
             self._plan_occlusion(end)
@@ -301,7 +310,10 @@ class OptiTrackScene:
         return self._hidden_params
 
     def _label_index(self, number: float) -> int:
-        """Index among the labels of the marker with this number in the body."""
+        """Index among the labels of the marker with this number in the body.
+
+        Raises ValueError if there is none.
+        """
         return self._labels.index(self._behaviour.body_id << 16 | int(number))
 
     def _plan_occlusion(self, after_s: float) -> None:
@@ -404,7 +416,7 @@ class FakeOptiTrackServer:
 
     @property
     def clients(self) -> tuple[Address, ...]:
-        """Addresses of the unicast clients."""
+        """Addresses of the unicast clients; () in multicast."""
         with self._lock:
             return tuple(self._clients)
 
@@ -455,7 +467,10 @@ class FakeOptiTrackServer:
         self.stop()
 
     def _stream(self) -> None:
-        """Send frames at the rate in world time, each with the world of its due time."""
+        """Send frames at the rate in world time until stopped, each of the world at its time.
+
+        After a pause of over 2 s (`PAUSED_S`) the missed frames are not sent.
+        """
         start_s = self._world.now()
         number = 0
         while not self._closing.is_set():
@@ -481,7 +496,7 @@ class FakeOptiTrackServer:
             self._send(frame, (host, self._unicast_port or port), version)
 
     def _serve(self) -> None:
-        """Answer the command channel."""
+        """Answer the command channel until stopped; datagrams that are no requests are ignored."""
         assert self._command is not None
         while not self._closing.is_set():
             self._forget_silent_clients()
@@ -499,7 +514,10 @@ class FakeOptiTrackServer:
                 self._send(answer, address, self._version_of(address))
 
     def _answers(self, request: ClientRequest, address: Address) -> list[Message]:
-        """Execute a request; most have one answer, some have none."""
+        """Execute a request; most have one answer, some have none.
+
+        Unknown ones are answered by UNRECOGNIZED_REQUEST.
+        """
         if request.id == MessageId.CONNECT:
             self._welcome(address, request.wanted_version)
             return [self._server_info()]
@@ -543,7 +561,11 @@ class FakeOptiTrackServer:
         )
 
     def _obey(self, command: str, address: Address) -> Message:
-        """Answer to a REQUEST."""
+        """Answer to a REQUEST: the frame rate, or the bitstream, which an argument sets.
+
+        Refused if the client is unknown or cannot have that version; unrecognized for other
+        commands.
+        """
         name, _, argument = command.partition(',')
         if name == 'FrameRate':
             return natnet.Response(np.float32(self._rate_hz).tobytes())

@@ -29,9 +29,10 @@ PLACEMENT_STD_M = 0.03
 
 
 def default_folder(namespace: str = '/') -> Path:
-    """Folder of the fakes of this user, DDS domain and ROS namespace.
+    """Folder of the fakes of this user, DDS domain and ROS namespace; it is not made.
 
-    ``namespace``: such as ``/left``; every cell of a domain has its own World.
+    ``namespace``: such as ``/left``; every cell of a domain has its own World. In the temporary
+    directory; the domain is ROS_DOMAIN_ID, 0 if unset.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     cell = namespace.rstrip('/').replace('/', '.')
@@ -57,7 +58,7 @@ def make_private_folder(folder: Path) -> None:
 
 
 def require_private(folder: Path) -> None:
-    """Raises `InputError` unless the path is a folder, no link, private to this user."""
+    """Raise InputError unless the path is a folder, no link, private to this user (mode 700)."""
     try:
         found = folder.lstat()
     except OSError as error:
@@ -174,7 +175,7 @@ def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> Wo
     """World in `folder` ('' for the default one), opened as soon as it has been made.
 
     ``folder, namespace``: see `default_folder`; ``timeout_s``: longest wait, wall time, s. Raises
-    InputError if there is none after `timeout_s`.
+    InputError if there is none after `timeout_s`, or the default folder is not private.
     """
     path = Path(folder) if folder else default_folder(namespace)
     deadline = time.monotonic() + timeout_s

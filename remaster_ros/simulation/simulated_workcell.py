@@ -86,7 +86,9 @@ def plan_tour(
 def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
     """Joint solutions, (m, k) per pose, of each split in the order of the visits.
 
-    A simulated session goes from one split to the other, each nearest first.
+    Keys are 'optimization' and 'validation', [] without poses. A simulated session begins at the
+    position within the limits nearest to zero and goes from one split to the other, each nearest
+    first.
     """
     visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
     q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)
@@ -385,7 +387,9 @@ def choose_robot(
 ) -> SerialChain:
     """Chain of the cell's robot, or of another robot that replaces it in the cell.
 
-    Raises InputError if there is no such robot, or its URDF is invalid.
+    ``robot``: name of a shipped URDF or path of a file, None for the cell's; ``base_link,
+    tip_link``: None for those of the cell. Changes the cell. Raises InputError if there is no such
+    robot, or its URDF is invalid.
     """
     if robot is not None:
         shipped = config_path(f'robots/{robot}.urdf')
@@ -409,9 +413,9 @@ def choose_robot(
 
 
 def choose_sensors(cell: Workcell, chosen: tuple[str, ...] | None) -> None:
-    """Reduce the cell to the chosen sensors; if need be, poses face the first of them.
+    """Reduce the cell to the chosen sensors, in place; if need be, poses face the first of them.
 
-    Raises InputError if the cell has no such sensor.
+    None leaves all. Raises InputError if the cell has no such sensor.
     """
     if chosen is None:
         return

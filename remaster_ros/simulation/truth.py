@@ -37,7 +37,7 @@ class Warming:
     start_s: float = 0.0
 
     def at(self, t: FloatArray) -> FloatArray:
-        """Temperature above that of the beginning, K."""
+        """Temperature above that of the beginning, K, at times t, s; 0 before it."""
         since = np.maximum(np.asarray(t, float) - self.start_s, 0.0)
         return self.kelvin * (1.0 - np.exp(-since / self.time_s))
 
@@ -114,9 +114,10 @@ class SessionTruth:
 def place_sensor(
     near: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Random T_R_N of a sensor near a place, looking at a point of R.
+    """Random T_R_N (4, 4) of a sensor near a place, with its z axis towards a point of R.
 
-    ``near, look_at``: m, in R; ``std_m``: standard deviation of the place per axis.
+    ``near, look_at``: m, in R; ``std_m``: standard deviation of the place per axis. The roll about
+    z is uniform within 0.2 rad.
     """
     position = np.asarray(near, float) + rng.normal(0.0, std_m, 3)
     turn = looking_at(position, look_at, rng.uniform(-ROLL_RAD, ROLL_RAD))
@@ -126,7 +127,7 @@ def place_sensor(
 def mount_body(rng: np.random.Generator) -> FloatArray:
     """Random R_T_B (3, 3) of a camera, board or probe.
 
-    It looks roughly along the tool's z axis.
+    It looks along the tool's z axis within 0.2 rad, at any roll.
     """
     tilt = rng.uniform(-ROLL_RAD, ROLL_RAD, 2)
     return matrix_from_rpy((*tilt, rng.uniform(-np.pi, np.pi)))

@@ -89,7 +89,7 @@ class World:
 
     @classmethod
     def create(cls, folder: Path, content: WorldContent) -> World:
-        """New World, written into `folder`."""
+        """New World, written into `folder`, in place of any World there."""
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         (folder / MOTION_FILE).write_text('')
         WorldClock.create(folder, START_S, time.monotonic())
@@ -124,11 +124,14 @@ class World:
         return self.clock.now()
 
     def sleep_until(self, t: float) -> None:
-        """Wait until world time t."""
+        """Wait until world time t, s; returns at once if it has passed."""
         self.clock.sleep_until(t)
 
     def kept_up(self, sensor: str, t: float) -> None:
-        """Record that the fake of a sensor has done everything due until world time t."""
+        """Record that the fake of a sensor has done everything due until world time t, s.
+
+        Nothing for a name that is no sensor of the World.
+        """
         if sensor in self.truth.sensors:
             self.clock.kept_up(list(self.truth.sensors).index(sensor), t)
 
@@ -142,7 +145,9 @@ class World:
     ) -> None:
         """Move the arm along waypoints (reported joint positions), for all processes.
 
-        ``reference``: as in `Motion.follow`.
+        ``start_s``: world time from which those of the waypoints count; ``reference``: as in
+        `Motion.follow`. Appends a line to the file of motions, which every process reads when it
+        next looks at the arm.
         """
         now = None if reference is None else [part.tolist() for part in reference]
         with (self.folder / MOTION_FILE).open('a') as file:
@@ -171,7 +176,7 @@ class World:
                 self._motion.follow(start_s, waypoints, reference)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad or m) and velocities (per s) by the encoders, (k,)."""
+        """Joint positions (rad or m) and velocities (per s) by the encoders at time t, (k,)."""
         with self._lock:
             self._read_motions()
             return self._motion.at(t)
@@ -196,7 +201,7 @@ class World:
         return self.joint_speed(t) > 1e-4
 
     def faults(self, device: str) -> Numbers:
-        """Present faults of the device, see `remaster_ros.simulation.faults`."""
+        """Present faults of the device ('robot' or a sensor), fault -> number; {} without any."""
         return self._faults.of(device)
 
     # What sensors see
@@ -204,7 +209,8 @@ class World:
     def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> FloatArray:
         """True position of a marker, '' for the first, in the sensor's frame at time t, m, (3,).
 
-        The fault ``swapped`` applies to the first marker only.
+        Without noise. The fault ``swapped`` applies to the first marker only. Raises InputError
+        for an unknown sensor.
         """
         seen_by = self._sensor(sensor)
         q, shift = self.reported(t)[0], None
@@ -227,11 +233,15 @@ class World:
         return marker_N
 
     def warming_k(self, t: float) -> float:
-        """Temperature at time t above that of the beginning, K."""
+        """Temperature at world time t, s, above that of the beginning, K."""
         return float(self.truth.warming.at(np.array(t)))
 
     def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
-        """Whether the sensor sees a marker, '' for the first, at time t, with no link between."""
+        """Whether the sensor sees a marker, '' for the first, at time t, with no link between.
+
+        False also beyond the sensor's acceptance angle from the tool's z axis, and with the faults
+        ``occluded`` and ``intermittent``. Raises InputError for an unknown sensor.
+        """
         true_sensor, faults = self._sensor(sensor), self.faults(sensor)
         if 'occluded' in faults or in_outage(faults.get('intermittent'), t):
             return False

@@ -82,15 +82,16 @@ class Pace:
         self._fakes: dict[int, _Participant] = {}
 
     def published(self, stamp_s: float) -> None:
-        """Record that a report with this stamp is published now."""
+        """Record that a report with this stamp, s, is published now."""
         with self._lock:
             self._reports.append((stamp_s, self._clock.now()))
 
     def took(self, pid: int, stamp_s: float, *, leads: bool = False) -> None:
-        """Record that a process has received all reports up to the one with this stamp.
+        """Record that a process has received all reports up to the one with this stamp, s.
 
         If no report has the stamp, it is a world time until which the process has done everything.
         A process that ``leads`` the arm confirms each report after the command that it has sent.
+        Progress never decreases.
         """
         with self._lock:
             now = self._clock.now()
@@ -121,7 +122,7 @@ class Pace:
         self._clock.hold(min(not_led_s + LEAD_AHEAD_S, slowest_s + self._ahead_s, most_s))
 
     def _first_after(self, done_s: float) -> float:
-        """World time of the first report after a progress, s; infinite without such a report."""
+        """World time of the publication of the first report after a progress, s; else infinity."""
         return next(
             (published_s for _, published_s in self._reports if published_s > done_s), math.inf
         )
@@ -130,7 +131,11 @@ class Pace:
 def _progress_of_running(
     participants: dict[int, _Participant], wall: float, patience_s: float = PATIENCE_WALL_S
 ) -> Iterable[float]:
-    """World time, s, of the progress of each running process with a sign within the patience."""
+    """World time, s, of the progress of each running process with a sign within the patience.
+
+    ``wall``: present time of the monotonic clock, s. Whether a process runs is looked up every 0.1
+    s.
+    """
     for pid, p in participants.items():
         if wall - p.looked_wall > LOOK_WALL_S:
             p.runs, p.looked_wall = is_running(pid), wall
@@ -161,7 +166,10 @@ class WorldClock:
 
     @staticmethod
     def create(folder: Path, start_s: float, started_wall_s: float) -> None:
-        """Write the file: world time was `start_s` at `started_wall_s` of the monotonic clock."""
+        """Write the file: world time was `start_s` at `started_wall_s` of the monotonic clock.
+
+        Time then runs without a limit, and without fake sensors.
+        """
         line = _LINE.pack(started_wall_s, start_s, math.inf, math.inf)
         (folder / CLOCK_FILE).write_bytes(_VERSION.pack(0) + 2 * line + bytes(SLOTS * _SLOT.size))
 
@@ -183,9 +191,10 @@ class WorldClock:
             time.sleep(max(remaining / self.rate, POLL_WALL_S))
 
     def hold(self, limit_s: float) -> None:
-        """Set the limit of world time to `limit_s`, until the next call.
+        """Set the limit of world time to `limit_s`, but not below now, until the next call.
 
-        For one process only, the owner of the clock.
+        For one process only, the owner of the clock. Without another call the limit is void after
+        3 s (`HELD_WALL_S`).
         """
         wall = time.monotonic()
         now = self.now(wall)
@@ -197,11 +206,14 @@ class WorldClock:
         _VERSION.pack_into(self._memory, 0, version + 1)
 
     def kept_up(self, slot: int, now_s: float) -> None:
-        """Record that this process, a fake sensor, has done everything due until `now_s`."""
+        """Record that this process, a fake sensor, has done everything due until `now_s`.
+
+        ``slot``: number of the sensor, 0 to 15.
+        """
         _SLOT.pack_into(self._memory, _slot_at(slot), os.getpid(), now_s)
 
     def slots(self) -> dict[int, tuple[int, float]]:
-        """(process id, world time of its progress, s) of each fake sensor that takes part."""
+        """Slot -> (process id, world time of its progress, s) of each fake sensor in use."""
         found = {i: _SLOT.unpack_from(self._memory, _slot_at(i)) for i in range(SLOTS)}
         return {slot: (pid, done_s) for slot, (pid, done_s) in found.items() if pid}
 
@@ -218,10 +230,12 @@ class WorldClock:
 
 
 def _line_at(version: int) -> int:
+    """Place in the clock's file of the line of a version: two lines in turn."""
     return _VERSION.size + version % 2 * _LINE.size
 
 
 def _slot_at(slot: int) -> int:
+    """Place in the clock's file of a fake sensor's slot, from 0."""
     return _line_at(1) + _LINE.size + slot * _SLOT.size
 
 

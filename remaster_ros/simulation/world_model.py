@@ -49,10 +49,13 @@ class Arm(Protocol):
     slides: BoolArray  # Whether each joint slides, (k,)
 
     def state(self, q: FloatArray) -> ArmState:
-        """State of every joint for true joint angles q, rad, (n, k)."""
+        """State of every joint for true joint positions q, rad or m, (n, k)."""
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:
-        """Gravity's torque about each joint, in its positive direction, N m, (n, k)."""
+        """Gravity's torque about each joint, in its positive direction, N m, (n, k).
+
+        The force along it, N, for a joint that slides. q: true positions.
+        """
 
     def base_moment(self, q: FloatArray) -> FloatArray:
         """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
@@ -83,7 +86,10 @@ class Round:
 
 
 def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circumstances:
-    """Quantities that effects may depend on, per configuration."""
+    """Quantities that effects may depend on, per configuration.
+
+    Torques and frames are those of the true joint angles. A joint's approach is 0 until it moves.
+    """
     q, per_radian = visited.q + joint_offsets, np.where(arm.slides, SLIDE_M, 1.0)
     move = visited.q - visited.previous_q
     approach = np.zeros_like(q)
@@ -114,7 +120,10 @@ def deviation(
     sensors: tuple[str, ...],
     markers: tuple[str, ...],
 ) -> Deviation:
-    """Deviation by all effects together, with sensors and markers of these names."""
+    """Deviation by all effects together, with sensors and markers of these names.
+
+    Zero without effects.
+    """
     n, k = c.q.shape
     total = Deviation.none(n, k, sensors, markers)
     for effect in effects:
@@ -214,7 +223,7 @@ class WorldModel:
 
     @cached_property
     def distance_m(self) -> dict[str, float]:
-        """Mean distance of each sensor's markers, m."""
+        """Mean distance of each sensor's markers from it over the visits, m, by name."""
         seen_by = [name for name, sensor in self.sensors.items() for _ in sensor.markers]
         points = self._as_drawn.reshape(-1, len(seen_by), 3)
         length = np.linalg.norm(points, axis=2).mean(axis=0)
@@ -224,11 +233,12 @@ class WorldModel:
         }
 
     def response(self, effect: HiddenEffect) -> FloatArray:
-        """Change of the readings by an effect, m, (n, 3)."""
+        """Change of the readings by an effect alone, m, (n, 3), in the rows of `seen`."""
         return self.seen([effect]) - self._as_drawn
 
     @cached_property
     def _as_drawn(self) -> FloatArray:
+        """Readings without effects, as `seen`, m, (n, 3)."""
         return self.seen()
 
     @cached_property
@@ -269,10 +279,12 @@ class WorldModel:
 
     @cached_property
     def _basis(self) -> FloatArray:
+        """Orthonormal basis of what the fit absorbs, (3 n, rank)."""
         return _span(self.nuisance.reshape(-1, self.nuisance.shape[2]))
 
     @cached_property
     def _basis_without_markers(self) -> FloatArray:
+        """Orthonormal basis of what a fit with fixed markers absorbs, (3 n, rank)."""
         fixed = self.nuisance[:, :, : -3 * len(self.markers)]
         return _span(fixed.reshape(-1, fixed.shape[2]))
 
@@ -286,7 +298,7 @@ class WorldModel:
         return float(np.sqrt(np.mean(np.sum(remainder**2, axis=1))))
 
     def of_size(self, effect: HiddenEffect, size_m: float) -> HiddenEffect:
-        """Effect scaled to a size by `size_m`."""
+        """Effect scaled so that `size_m` gives this size, m, up to its small nonlinearity."""
         for _ in range(3):  # all but linear
             effect = effect.scaled(size_m / self.size_m(effect))
         return effect
