@@ -31,7 +31,10 @@ _DAMAGED = (
 
 @contextmanager
 def damage_as_input_error() -> Iterator[None]:
-    """Raise InputError in place of the exceptions for a damaged or locked archive."""
+    """Raise InputError in place of the exceptions for a damaged or locked archive.
+
+    Context manager. An InputError passes as it is.
+    """
     try:
         yield
     except _DAMAGED:

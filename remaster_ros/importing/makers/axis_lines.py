@@ -19,7 +19,11 @@ _LONGEST = 200
 
 
 def read(text: str) -> NamedColumns | None:
-    """Points of a report with one number a line; None for other text."""
+    """Points of a report with one number a line; None for other text.
+
+    Columns X, Y and Z, and ``name`` if the points have several. Raises InputError, with the line,
+    if axes do not follow each other as X, Y and Z of one point.
+    """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [match['axis'] for _, line in lines[:_SEEN] if (match := _match(line))]
     if len(seen) < 2 * len(_AXES) or 2 * len(seen) <= len(lines[:_SEEN]):
@@ -60,4 +64,5 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _match(line: str) -> re.Match[str] | None:
+    """Match of a line with name, axis and value; None for others, and over 200 letters."""
     return _LINE.fullmatch(line) if len(line) <= _LONGEST else None

@@ -30,7 +30,12 @@ _OF_GROUP = re.compile(r'\s*(?:Group\s*:\s*(\d+))?\s*(?:Config\s*:\s*([^:=]*))?\
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a FANUC program or of position registers; None for other text."""
+    """Joint positions of a FANUC program or of position registers; None for other text.
+
+    In degrees, J3 coupled to J2. Cartesian and untaught positions and other motion groups are left
+    out, with notes. Raises InputError, with the line, for text that cannot be read, increments, or
+    if there are no joint positions.
+    """
     if re.search(r'\$POSREG\b.*\bARRAY\b', text):
         return _registers(text)
     if not re.search(r'^[ \t]*/PROG\b|^[ \t]*PR?\[\d+[^\n]*\]\s*\{', text, re.MULTILINE):
@@ -90,7 +95,7 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _registers(text: str) -> NamedColumns:
-    """Position registers of `posreg.va` in joints, of the first motion group."""
+    """Position registers of `posreg.va` in joints, of the first motion group; raises as `read`."""
     found: list[tuple[int, str, dict[str, str]]] = []
     places, untaught, others = set[int](), set[int](), False
     values: dict[str, str] | None = None
@@ -149,7 +154,11 @@ def _positions(
     untaught: int,
     others: bool,
 ) -> NamedColumns:
-    """Columns of joint positions, with notes on what was left out."""
+    """Columns of joint positions, with notes on what was left out.
+
+    `places`, `untaught`: numbers of Cartesian and untaught positions; `others`: whether there were
+    other motion groups.
+    """
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
     notes += (f'{untaught} positions that were never taught were left out',) * bool(untaught)
     notes += ('the axes of other motion groups were left out',) * others

@@ -19,7 +19,11 @@ _REMEDY = (
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a Yaskawa job; None for other text."""
+    """Joint positions of a Yaskawa job, degrees or pulses; None for other text.
+
+    Cartesian positions are left out, with a note. Raises InputError, with the line, for mixed
+    units, text that cannot be read, or if there are no joint positions.
+    """
     if _JOB.match(text) is None:
         return None
     found: list[tuple[int, str, dict[str, str]]] = []

@@ -19,7 +19,11 @@ _START = re.compile(r'\s*(?:\{\s*"|\[\s*[\[{])')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Records of JSON or of JSON lines; None for other text."""
+    """Records of JSON or of JSON lines; None for other text.
+
+    Raises InputError, with the line, for damaged JSON, a key that is there twice, or JSON without
+    records of equal keys.
+    """
     if not _START.match(text):
         return None
     try:
@@ -51,7 +55,8 @@ class _Decoder(json.JSONDecoder):
     def whole(self) -> Any:
         """The value of the text, or a list of several values in sequence.
 
-        None if it is not JSON.
+        None if it consists of lists in lines. Raises InputError, with the line, for text that is
+        not JSON.
         """
         values = records.Items()
         at = 0
@@ -73,10 +78,14 @@ class _Decoder(json.JSONDecoder):
         return values[0] if len(values) == 1 else values
 
     def _line(self, at: int) -> int:
+        """Line, from 1, of a place in the text."""
         return bisect_left(self._ends, at) + 1
 
     def _array(self, at: tuple[str, int], scan_once: Any, **rest: Any) -> Any:
-        """Decode an array, with the line of its begin; return it and the index behind it."""
+        """Decode an array, with the line of its begin; return it and the index behind it.
+
+        `at`: text and index behind the bracket.
+        """
         values, end = json.decoder.JSONArray(at, scan_once, **rest)  # type: ignore[attr-defined]
         found = records.Items(values)
         found.line = self._line(at[1] - 1)

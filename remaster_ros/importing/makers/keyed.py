@@ -20,7 +20,12 @@ _DELIMITERS = ' \t:;,=<("'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Numbers by their names; None for other text."""
+    """Numbers by their names; None for other text.
+
+    Of the first 50 lines with three numbers, over half must have three named ones. Lines with
+    fewer numbers are left out, with a note. Raises InputError, with the line, if names differ
+    between lines.
+    """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [line for _, line in lines[:_SEEN] if len(_NUMBERS.findall(line)) >= _FEWEST]
     # Titles have such words as well.
@@ -57,6 +62,6 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _is_keyed(line: str) -> bool:
-    """Whether a line has enough named numbers, each name once."""
+    """Whether a line has at least three named numbers, each name once."""
     keys = [pair[0] for pair in _PAIR.findall(line)]
     return len(keys) >= _FEWEST and len({*keys}) == len(keys)

@@ -27,7 +27,11 @@ _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Axis positions in a text of KUKA's; None for other text."""
+    """Axis positions in a text of KUKA's, degrees; None for other text.
+
+    Cartesian points are left out, with a note. Raises InputError, with the line, for relative
+    moves, text that cannot be read, or if there are no axis positions.
+    """
     if not (re.search(r'\{[^{}]*\b[Aa]1\s+[-+.\d]', text) or _PROGRAM.match(text)):
         return None
     found: list[tuple[int, str, dict[str, str]]] = []
@@ -66,13 +70,16 @@ def read(text: str) -> NamedColumns | None:
 
 
 def moves(text: str) -> tuple[str, ...]:
-    """Names of the points to which the moves of a program go, in order, with repetitions."""
+    """Names of the points to which the moves of a program go, in order, with repetitions.
+
+    Moves are PTP, LIN, SPTP and SLIN at the begin of a line; () if there are none.
+    """
     codes = (line.partition(';')[0] for line in text.splitlines())
     return tuple(_point(found[1]) for found in map(_MOVE.match, codes) if found)
 
 
 def _point(name: str) -> str:
-    """Name of a point from the name of its data: P1 for XP1."""
+    """Name of a point from the name of its data: P1 for XP1; other names stay."""
     return name[1:] if name.upper().startswith('X') and len(name) > 1 else name
 
 

@@ -30,7 +30,12 @@ _FEWEST, _MOST = 2, 12
 
 
 def read(text: str) -> NamedColumns | None:
-    """Lists of a log, with their names or times; None for other text."""
+    """Lists of a log, with their names or times; None for other text.
+
+    Lists of three numbers are points, of 4 to 12 joints. Lines with up to two numbers are left
+    out, with a note. Raises InputError, with the line, for other lines, lists of other lengths,
+    Cartesian poses, or external axes in use.
+    """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     # Titles and keys have no numbers.
     head = next((i for i, (_, line) in enumerate(lines) if re.search(r'\d', line)), len(lines))
@@ -88,13 +93,13 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _label_and_list(line: re.Match[str]) -> tuple[str, str]:
-    """Text before the list of a line, and text within it."""
+    """Text before the list of a line, without delimiters, and text within its brackets."""
     before = line['before'] or line['head'] or ''
     return before.strip(_DELIMITERS), (line['list'] or line['row'] or '').strip()
 
 
 def _has_no_external_axes(line: re.Match[str] | None) -> bool:
-    """Whether the external axes of a line are absent, unused or at 0."""
+    """Whether the external axes of a line are absent, unused (from 9e9 on) or at 0."""
     external = (line and line['external']) or '0'
     cells = [cell.strip() for cell in external.split(',')]
     return all(

@@ -43,12 +43,16 @@ _KINDS = ('Rigid Body', 'Marker', 'Rigid Body Marker')
 
 
 def _likeliness(kind: str) -> int:
-    """Rank of a kind of asset, 0 for the likeliest."""
+    """Rank of a kind of asset, such as ``Marker``, 0 for the likeliest; 3 if unknown."""
     return _KINDS.index(kind) if kind in _KINDS else len(_KINDS)
 
 
 def read(text: str) -> NamedColumns | None:
-    """Columns of a take; None for other text. Raises InputError for a damaged one."""
+    """Columns of a take; None for other text. Raises InputError for a damaged one.
+
+    Frame, time, and position (and quaternion) of each asset. Markers without a label are put
+    together to moving ones, with notes; if that fails, InputError is raised, too.
+    """
     start = _START.match(text) or _HEADLESS.match(text)
     if start is None and _HEADLESS.match(text.partition('\n')[2]):
         raise unexpected(1, text.partition('\n')[0], 'Format Version')
@@ -179,16 +183,19 @@ class _Track:
 
     @property
     def seen(self) -> BoolArray:
+        """Whether the marker was seen in each frame, (n,)."""
         return self.of >= 0
 
     def extent(self) -> float:
-        """Longest side of the box around the positions."""
+        """Longest side of the box around the positions, in their unit; ValueError without any."""
         return float(np.ptp(self.places[self.seen], axis=0).max())
 
     def distance(self, places: FloatArray, time_s: FloatArray) -> float:
-        """Distance of a piece from this marker's seen or predicted position.
+        """Distance of a piece from this marker's seen or predicted position, in their unit.
 
-        Infinite if the piece begins too long after the marker was lost.
+        `places`: of the piece, NaN where not seen, (n, 3); `time_s`: of the frames, (n,). The
+        median where both are seen, else at the piece's first frame, less twice the way at the
+        marker's last speed. Infinite if the piece begins over 0.5 s after the marker was lost.
         """
         seen = np.isfinite(places[:, 0])
         both = seen & self.seen
@@ -208,7 +215,10 @@ class _Track:
         )
 
     def add(self, label: str, places: FloatArray) -> None:
-        """Add a piece in the frames in which the marker was not seen."""
+        """Add a piece in the frames in which the marker was not seen, in place.
+
+        `label`: of the piece; `places`: NaN where not seen, (n, 3).
+        """
         fresh = np.isfinite(places[:, 0]) & ~self.seen
         self.places[fresh] = places[fresh]
         self.of[fresh] = len(self.labels)

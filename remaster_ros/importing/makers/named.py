@@ -50,22 +50,26 @@ class NamedColumns:
 
 
 def unexpected(number: int, line: str, expected: str) -> InputError:
-    """InputError on a line, with its number, its content and what is expected there."""
+    """InputError on a line, to be raised, with its number, content and what is expected there.
+
+    Only the first 60 letters are shown.
+    """
     text = line.strip()
     shown = text if len(text) <= SHOWN else f'{text[:SHOWN]}…'
     return InputError(f'line {number}: {shown!r}, where {expected} is expected')
 
 
 def first_names(names: Sequence[str]) -> str:
-    """The first five names, and the number of others."""
+    """The first five names, separated by commas, and the number of others, as text."""
     more = f' and {len(names) - 5} more' if len(names) > 5 else ''
     return f'{", ".join(names[:5])}{more}'
 
 
 def leading_column(labels: list[str]) -> tuple[list[str], list[str]]:
-    """Name and cells of a column of the texts before the numbers of each line; [] if it is none.
+    """Name and cells of a column of the texts before the numbers of each line.
 
-    It is a time if all texts have one, a name if most of them are different.
+    The name is ['time'] if all texts have a time, ['name'] if over half of them are different,
+    else [] with the texts as cells.
     """
     stamps = [_TIME.search(words) for words in labels]
     if all(stamps):
@@ -85,8 +89,9 @@ def axes_in_order(
     """Joint positions as columns: their names, if any has one, then the axes in order.
 
     Each position in `found` is its line, name ('' for none) and axes such as ``A1``. `letters` are
-    that of the arm's axes, then those of external axes, which are left out if they stay at 0.
-    Raises InputError if a position lacks an axis.
+    that of the arm's axes, then those of external axes, which are left out if they stay at 0;
+    `unit`: of the arm's axes. Raises InputError if a position lacks an axis of the arm, or axes
+    are not numbered from 1, fewer than 2 or more than 100.
     """
     every = {axis for _, _, values in found for axis in values}
     if len(every) > _MOST_AXES:

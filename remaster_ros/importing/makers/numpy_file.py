@@ -20,9 +20,11 @@ _LIMIT = 64 * 1024**2
 
 
 def read(data: bytes) -> dict[str, str] | None:
-    """Arrays of a file as tab-separated text; None for other files.
+    """Arrays of a file as tab-separated text, by name; None for other files.
 
-    Arrays with equally many rows are columns of one text, by the name of the first.
+    Arrays with equally many rows are columns of one text, by the name of the first; those of fewer
+    than two are left out. The name is '' for a single array. Raises InputError for damaged files,
+    arrays of over 512 MiB, or arrays that are no table.
     """
     if data.startswith(b'\x93NUMPY'):
         array = _loaded(data, '')
@@ -56,7 +58,7 @@ def read(data: bytes) -> dict[str, str] | None:
 
 
 def _loaded(data: bytes, where: str) -> NDArray[Any]:
-    """Array of bytes in NumPy's format. Raises InputError if they are damaged."""
+    """Array of bytes in NumPy's format. Raises InputError, beginning with `where`, if damaged."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:
@@ -70,7 +72,11 @@ def _loaded(data: bytes, where: str) -> NDArray[Any]:
 
 
 def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], list[list[str]]]:
-    """Names and columns of an array as text; a matrix becomes its numbers row by row."""
+    """Names and columns of an array as text; a matrix becomes its numbers row by row.
+
+    Rows are the first dimension, of three at most; a structured array has the names of its fields.
+    Raises InputError, beginning with `where`, for other shapes or types.
+    """
     if array.dtype.names:
         fields = [_columns(array[own], own, where) for own in array.dtype.names]
         return [one for header, _ in fields for one in header], [
@@ -89,14 +95,14 @@ def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], lis
 
 
 def _labels(name: str, width: int) -> list[str]:
-    """Names of the columns of an array: x, y, z for three, else numbers."""
+    """Names of an array's columns: `name` for one, then x, y, z for three, else numbers."""
     if width == 1:
         return [name]
     return [f'{name} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))]
 
 
 def _as_text(header: list[str], columns: list[list[str]]) -> str:
-    """Tab-separated text of columns, below a header if there is one."""
+    """Tab-separated text of columns, below a header if any; white space becomes a blank."""
     rows = [header] if header else []
     rows += [list(row) for row in zip(*columns)]
     clean = (' '.join(cell.split()) for row in rows for cell in row)

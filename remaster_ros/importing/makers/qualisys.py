@@ -22,7 +22,12 @@ _BODY = (*_AXES, 'Roll', 'Pitch', 'Yaw', 'Residual', *(f'Rot[{i}]' for i in rang
 
 
 def read(text: str) -> NamedColumns | None:
-    """Columns of a capture; None for other text."""
+    """Columns of a capture; None for other text.
+
+    Time, position, mm, and the quaternion of bodies. Raises InputError, with the line, for missing
+    names or rate, rows of other lengths, times that do not increase, or matrices that are no
+    rotations.
+    """
     if _START.match(text) is None:
         return None
     head: dict[str, list[str]] = {}
@@ -94,7 +99,11 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _position_cells(number: int, line: str, cells: list[str]) -> list[str]:
-    """Position, and quaternion for a body, of one marker or body; empty cells if it was lost."""
+    """Position, mm, and quaternion x, y, z, w for a body, of one marker or body, as text.
+
+    Empty cells if it was lost: 0 0 0 or nothing. Raises InputError, with the line, if numbers are
+    missing or the matrix is no rotation.
+    """
     size = 3 if len(cells) == len(_AXES) else 7
     given = [cell for cell in cells if cell]
     if not given or all(float(cell) == 0.0 for cell in cells[:3] if cell):

@@ -37,7 +37,11 @@ _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint targets of a module, or of a log; None for other text."""
+    """Joint targets of a module, degrees, or of a log; None for other text.
+
+    Cartesian targets are left out, with a note. Raises InputError, with the line, for text that
+    cannot be read, or if there are no joint targets.
+    """
     lower = text.lower()
     # Looking for words is much faster than for patterns, and logs are large.
     known = any(word in lower for word in ('jointtarget', 'moveabsj', 'robtarget', 'module')) and (
@@ -96,7 +100,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
-    """Statements without comments, with the line on which each begins."""
+    """Statements without comments, with the line, from 1, on which each begins.
+
+    Lines of the language that end without a semicolon are left out.
+    """
     statements: list[tuple[int, str]] = []
     parts: list[str] = []
     start = 0

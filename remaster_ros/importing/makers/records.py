@@ -41,7 +41,11 @@ Record = tuple[int, dict[str, str]]
 
 
 def read(kind: str, data: Any) -> NamedColumns | None:
-    """Rows of nested data, whose scalars are text; None if it has no records."""
+    """Rows of nested data, whose scalars are text; None if it has no records.
+
+    `kind`: of the file, for messages. None also for records of one cell or more than 500. Raises
+    InputError, with the line, if a record has other keys than most.
+    """
     found, names, dropped_keys = _records(data, ())
     if len(found) < _FEWEST_RECORDS:
         return None
@@ -76,7 +80,10 @@ def read(kind: str, data: Any) -> NamedColumns | None:
 def _records(
     data: Any, names: Sequence[str]
 ) -> tuple[list[tuple[int, Any]], Sequence[str], list[str]]:
-    """Records in nested data with their lines, names of joints, and keys that are left out."""
+    """Records in nested data with their lines, names of joints, and keys that are left out.
+
+    `names`: of joints, if known. [] if there are no records.
+    """
     if isinstance(data, Items):
         if _are_records(data):
             return [(one.line or data.line, one) for one in data], names, []
@@ -126,7 +133,7 @@ def _records(
 
 
 def _weight(columns: dict[str, Items], size: int) -> int:
-    """Number of cells in one record of columns that have `size` values."""
+    """Number of cells in one record of the columns that have `size` values."""
     return sum(
         len(value[0]) if isinstance(value[0], (Items, Mapping)) else 1
         for value in columns.values()
@@ -135,13 +142,13 @@ def _weight(columns: dict[str, Items], size: int) -> int:
 
 
 def _are_records(data: Items) -> bool:
-    """Whether a list holds at least two records of one kind."""
+    """Whether a list holds at least two records, all of them mappings or all lists."""
     kinds = {type(one) for one in data}
     return len(data) >= _FEWEST_RECORDS and kinds in ({Mapping}, {Items})
 
 
 def _named(header: Sequence[str], row: Items) -> Mapping:
-    """Record of a row with the names of a header."""
+    """Record of a row with the names of a header; raises InputError if their numbers differ."""
     if len(row) != len(header):
         raise unexpected(row.line, str([*row]), f'{len(header)} values')
     found = Mapping(zip(header, row))
@@ -150,7 +157,10 @@ def _named(header: Sequence[str], row: Items) -> Mapping:
 
 
 def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
-    """Records of a data frame written by column and key, row and key, or row and column."""
+    """Records of a data frame written by column and key, row and key, or row and column.
+
+    With their lines; [] if the mappings in `data` do not have equal keys, or are points.
+    """
     inner = [tuple(one) for one in data.values()]
     if len({*inner}) != 1 or any(
         isinstance(cell, (Items, Mapping)) for one in data.values() for cell in one.values()
@@ -170,7 +180,7 @@ def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
 
 
 def _with_name(key: str, record: Mapping) -> Mapping:
-    """Record with its key as the name."""
+    """Record with its key first, as ``name``; a name of its own stays."""
     found = Mapping({'name': key, **record})
     found.line = record.line
     return found
@@ -179,7 +189,12 @@ def _with_name(key: str, record: Mapping) -> Mapping:
 def _cells(
     name: str, value: Any, names: Sequence[str], depth: int, line: int
 ) -> Iterator[tuple[str, str]]:
-    """Yield column and text of each scalar of a record."""
+    """Yield column and text of each scalar of a record.
+
+    Columns are the keys on the way, separated by blanks; lists are numbered from 1, named by
+    `names` if equally many, or x, y, z for three numbers; 4×4 matrices become point and
+    quaternion. Raises InputError, with `line`, for over 20 levels.
+    """
     if depth > _DEEPEST:
         raise InputError(f'line {line}: more than {_DEEPEST} levels of brackets')
     if isinstance(value, Mapping):
@@ -233,7 +248,7 @@ def _of_mapping(
 
 
 def _pose(cells: Sequence[Any]) -> list[float]:
-    """Position and quaternion of sixteen numbers that are a pose; [] if they are none."""
+    """Position and quaternion x, y, z, w of sixteen numbers; [] if they are no pose."""
     if not all(NUMBER.fullmatch(str(one)) for one in cells):
         return []
     T = rigid(np.array(cells, float))
@@ -262,6 +277,6 @@ def _is_name(value: Any) -> bool:
 
 
 def _text(value: Any) -> str:
-    """Value as text with single blanks; '' for a text that stands for no value."""
+    """Value as text with single blanks; '' for null, none, nan or ~, in any case."""
     text = ' '.join(str(value).split())
     return '' if text.lower() in _EMPTY else text

@@ -15,7 +15,10 @@ _FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joints or points of a printed topic; None for other text."""
+    """Joints or points of a printed topic; None for other text.
+
+    Raises InputError, with the line, if lines differ in names or number of cells.
+    """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines:
         return None
@@ -28,7 +31,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _with_header(head: list[str], lines: list[tuple[int, str]]) -> NamedColumns | None:
-    """Joints as ROS 1 prints them; None if names and positions do not match."""
+    """Joints as ROS 1 prints them; None without time, or if names and positions do not match.
+
+    Raises InputError, with the line, if the names change.
+    """
     columns = {cell: i for i, cell in enumerate(head)}
     names, positions = dict[str, int](), dict[str, int]()
     for cell, i in columns.items():
@@ -67,7 +73,7 @@ def _names(cells: list[str]) -> list[str]:
 
 
 def _without_header(lines: list[tuple[int, str]]) -> NamedColumns:
-    """Joints as ROS 2 prints them. Raises InputError if the names change."""
+    """Joints as ROS 2 prints them. Raises InputError, with the line, if the names change."""
     first = _names([cell.strip() for cell in lines[0][1].split(',')])
     rows = []
     for number, line in lines:
@@ -80,7 +86,7 @@ def _without_header(lines: list[tuple[int, str]]) -> NamedColumns:
 
 
 def _stamp(cells: list[str]) -> str:
-    """Time of a line that begins with second and nanosecond; '' for other lines."""
+    """Time of a line that begins with second and nanosecond, s, as text; '' for other lines."""
     if not (cells[0].isdigit() and cells[1].isdigit() and int(cells[1]) < 1e9):
         return ''
     return f'{cells[0]}.{int(cells[1]):09d}'
@@ -97,7 +103,10 @@ def _is_place(cells: list[str]) -> bool:
 
 
 def _places(lines: list[tuple[int, str]]) -> NamedColumns:
-    """Points of ``ros2 topic echo --csv``, with orientations if present."""
+    """Points of ``ros2 topic echo --csv``, m, with quaternions x, y, z, w if present.
+
+    Raises InputError, with the line, if one is of another kind than the first.
+    """
     rows = []
     width = len(lines[0][1].split(','))
     for number, line in lines:
@@ -117,7 +126,7 @@ def _places(lines: list[tuple[int, str]]) -> NamedColumns:
 def _named(
     joints: list[str], rows: list[tuple[str, ...]], lines: list[tuple[int, str]], unit: str
 ) -> NamedColumns:
-    """Columns of joint states; `unit` is that of the time."""
+    """Columns of joint states; `unit` is that of the time, `rows` are time and positions."""
     return NamedColumns(
         kind='joint states as ROS prints them',
         names=(f'time [{unit}]', *(f'{joint} position' for joint in joints)),

@@ -23,7 +23,11 @@ _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a program in URScript; None for other text."""
+    """Joint positions of a program in URScript, or of a .urp file, rad; None for other text.
+
+    Moves to Cartesian poses are left out, with a note. Raises InputError, with the line, for text
+    that cannot be read, a move to an unknown waypoint, or if there are no joint positions.
+    """
     if re.search(r'<JointAngles\b', text):
         return _waypoints(text)
     if not re.search(
@@ -104,7 +108,10 @@ _ANGLES = re.compile(r'\s*angles="([^"<>]*)"\s*/?\s*')
 
 
 def _waypoints(text: str) -> NamedColumns:
-    """Waypoints of a program that PolyScope saved (.urp), which is XML."""
+    """Waypoints of a program that PolyScope saved (.urp), which is XML, rad.
+
+    Raises InputError, with the line, for angles that cannot be read.
+    """
     found = []
     name = ''
     for number, line in enumerate(text.splitlines(), 1):
@@ -124,7 +131,10 @@ def _waypoints(text: str) -> NamedColumns:
 
 
 def _joints(number: int, line: str, listed: str) -> dict[str, str]:
-    """Joint angles of a list, rad, as text; d2r(…) is converted."""
+    """Joint angles of a list, rad, as text, by J1, J2, …; d2r(…) is converted.
+
+    Raises InputError, with the line, for other text.
+    """
     values = {}
     for i, cell in enumerate(listed.split(','), 1):
         degrees = _DEGREES.fullmatch(cell.strip())

@@ -35,7 +35,11 @@ Grid = dict[int, dict[int, str]]
 
 
 def read(data: bytes) -> dict[str, str] | None:
-    """Visible sheets of a workbook, name -> tab-separated text; None for other files."""
+    """Visible sheets of a workbook, name -> tab-separated text; None for other files.
+
+    None also for an archive of NumPy. Raises InputError for an .xls file, and other or damaged
+    archives.
+    """
     if data.startswith(b'\xd0\xcf\x11\xe0'):
         raise InputError('this is a workbook of an old form (.xls); save it as .xlsx or as CSV')
     if not data.startswith(b'PK\x03\x04'):
@@ -79,7 +83,7 @@ def _sheets(parts: zipfile.ZipFile) -> dict[str, str] | None:
 
 
 def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
-    """XML of a part. Raises InputError if it is damaged, too large or declares entities."""
+    """XML of a part. Raises InputError if it is damaged, over 256 MiB or declares entities."""
     with parts.open(name) as part:
         content = part.read(_LIMIT + 1)
     if len(content) > _LIMIT:
@@ -94,7 +98,7 @@ def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
 
 
 def _each(element: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    """Elements of a name in any namespace: strict workbooks have another one."""
+    """Elements of a name in any namespace, at any depth: strict workbooks have another one."""
     return (one for one in element.iter() if _name(one) == name)
 
 
@@ -115,7 +119,7 @@ def _text_of(element: ElementTree.Element) -> str:
 
 
 def _date_styles(styles: ElementTree.Element) -> list[bool]:
-    """Whether each cell style shows a date or a time."""
+    """Whether each cell style, by its number from 0, shows a date or a time."""
     custom_formats = {
         one.get('numFmtId'): bool(
             re.search('[ymdhs]', _NOT_LETTERS.sub('', one.get('formatCode', '')), re.IGNORECASE)
@@ -130,7 +134,12 @@ def _date_styles(styles: ElementTree.Element) -> list[bool]:
 def _grid(
     sheet: ElementTree.Element, shared: list[str], dates: list[bool], since_1904: bool
 ) -> Grid:
-    """Cells of a sheet by row and column, counted from 1."""
+    """Cells of a sheet with text by row and column, counted from 1.
+
+    `shared`: strings of the book; `dates`: as `_date_styles`; `since_1904`: whether days count
+    from 1904. Errors become ``nan``. Raises InputError for cells beyond a sheet's size or unknown
+    strings.
+    """
     grid: Grid = {}
     row_at = 0
     texts: set[tuple[int, int]] = set()
@@ -178,7 +187,10 @@ def _column(letters: str) -> int:
 
 
 def _number(value: str, is_date: bool, since_1904: bool) -> str:
-    """A number as a sheet shows it: a date as ISO 8601, digits without binary rounding."""
+    """A number as a sheet shows it: a date as ISO 8601, digits without binary rounding.
+
+    A date below 1 is a time of day. Text that is no number stays.
+    """
     try:
         number = float(value)
     except ValueError:
@@ -195,7 +207,11 @@ def _number(value: str, is_date: bool, since_1904: bool) -> str:
 
 
 def _with_decimal_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
-    """Grid with points in place of decimal commas in numbers that are stored as text."""
+    """Grid with points in place of decimal commas in numbers that are stored as text.
+
+    Changed in place. Not if all of them could be thousands, such as 1,234. `texts`: row and column
+    of these cells.
+    """
     found = [(r, c) for r, c in texts if _COMMA.fullmatch(grid[r][c])]
     if any(not _THOUSANDS.fullmatch(grid[r][c]) for r, c in found):
         for r, c in found:
@@ -204,7 +220,7 @@ def _with_decimal_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
 
 
 def _as_text(grid: Grid) -> str:
-    """Tab-separated line for each row of the sheet, without empty columns."""
+    """Tab-separated line for each row of the sheet from 1 on, without empty columns."""
     columns = sorted({column for row in grid.values() for column in row})
     text = io.StringIO()
     writer = csv.writer(text, delimiter='\t', lineterminator='\n')

@@ -22,7 +22,11 @@ _SEEN, _SHARE = 50, 0.7
 
 
 def read(text: str) -> NamedColumns | None:
-    """Records of YAML; None for other text."""
+    """Records of YAML; None for other text.
+
+    Raises InputError, with the line, for damaged YAML, keys that are there twice, or YAML without
+    records of equal keys.
+    """
     if not _START.match(text):
         return None
     lines = [line for line in text.splitlines() if line.strip()]
