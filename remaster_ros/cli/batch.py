@@ -176,7 +176,8 @@ def _refuse_foreign(folder: Path) -> None:
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
     """Return the job of a session; an unreadable file becomes the error of its row.
 
-    Its key is a checksum of version, seed, and the files that are read.
+    Its key is a checksum of version, seed, and the files that are read. ``out``: folder of the
+    batch, in which the session gets a folder of its own; ``baseline``: path, '' for none.
     """
     made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
     files = sorted(
@@ -205,6 +206,8 @@ def _digest(path: Path) -> str:
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
     """Return the last row of each key, as recorded earlier.
+
+    ``path``: of the journal, for the error.
 
     Raises InputError, with the line, if the journal is of something else.
     """

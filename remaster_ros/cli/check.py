@@ -190,6 +190,8 @@ def _before(
 ) -> tuple[list[Measured], list[str]]:
     """Return the checks of a history and their names, oldest first.
 
+    ``path``: of the history, for the errors.
+
     Raises InputError for a record of another arm or baseline, or a damaged record.
     """
     checks, names = [], []
@@ -234,7 +236,8 @@ def content_of(
     """Return what was found, as it is printed as JSON; null if a number is not known.
 
     ``names``: of the sessions, oldest first; ``iso``: figures of the newest. Lengths are in mm,
-    angles in degrees, as the keys say; checks count from 1.
+    angles in degrees, as the keys say; checks count from 1. ``smallest_mm``: change at the tool
+    that matters.
     """
 
     def known(value: float, scale: float) -> float | None:
@@ -375,6 +378,7 @@ def in_words(
     """Return what was found and what to do, in sentences, by the verdict.
 
     ``names``: of the checks, oldest first; ``smallest_mm``: change at the tool that matters.
+    ``joint_names``: in the chain's order.
     """
     if found.trend is not None:
         return _trend_in_words(found, joint_names, names, smallest_mm)

@@ -20,7 +20,8 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     """Yield a function (stage, share done) that shows a bar if stderr is a terminal.
 
     The bar shows the stage, its share done and the remaining time; it moves to and fro if the
-    share is unknown.
+    share is unknown. Without a terminal, or if ``quiet``, the function does nothing. Shares are
+    from 0, unknown, to 1.
     """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, share: None

@@ -159,6 +159,9 @@ def run(args: argparse.Namespace) -> int:
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
     """Return the URDF that the cell names: the given one, or the expanded xacro.
 
+    ``text``: its URDF, with which a file there already is no conflict; ``out``: the cell file, in
+    whose folder the expanded xacro belongs. Nothing is written.
+
     Raises InputError if that would replace a file.
     """
     if not is_xacro(robot):
@@ -285,7 +288,10 @@ def _narrowed(
 
 
 def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
-    """Return the number of fitted poses with a free path (at most `FEWEST_FITTED`), and tried."""
+    """Return the number of fitted poses with a free path (at most `FEWEST_FITTED`), and tried.
+
+    ``seed``: of the start, as in `free_start`.
+    """
     return count_with_free_path(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
 

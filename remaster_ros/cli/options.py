@@ -46,6 +46,7 @@ def _bounded(
     """Return an argument type: a finite number of type `kind` from `low` to `high`.
 
     ``what``: the kind in words. It raises ArgumentTypeError, which names the limit, for others.
+    The limits themselves are allowed; ``unit``: for the message.
     """
     unit = f' {unit}' if unit else ''
 

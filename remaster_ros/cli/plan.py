@@ -205,7 +205,9 @@ def free_start(model: CollisionModel, seed: int) -> FloatArray:
     """Return a configuration to start from, (k,): zero if free, else a free one near to it.
 
     At zero some arms lie stretched out along the floor (a UR does), without a free path. Zero also
-    if no tried configuration is free.
+    if no tried configuration is free. Free is with `RESERVE_M` more than the clearance.
+    `TRIED_STARTS` configurations are tried, drawn by ``seed`` ever further from zero, and cut to
+    the joint limits.
     """
     chain = model.chain
     spread = np.linspace(0.0, np.pi, TRIED_STARTS)[:, None]

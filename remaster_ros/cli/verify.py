@@ -121,7 +121,7 @@ def _on(session: Session, folder: Path) -> BoolArray:
     """Return whether the correction was on at each row, (n,).
 
     Unknown rows are on if the session states a correction; else InputError, with the first of
-    them.
+    them. ``folder``: of the session, for the error.
     """
     m = session.measurements
     state = np.full(len(m), -1) if m.correction is None else m.correction

@@ -62,7 +62,7 @@ class LiveResiduals:
         """Add a reading of a marker in the sensor's frame, m, (3,); NaN while it is hidden.
 
         Nothing if it is not finite, or no configuration is open. Raises KeyError for an unknown
-        marker.
+        marker. The mean of a configuration's readings counts, once it was recorded.
         """
         if self._q is not None and np.all(np.isfinite(position_N)):
             self._sums[sensor, marker] += [*position_N, 1.0]
@@ -100,15 +100,27 @@ class LiveResiduals:
         return self._offsets is not None
 
     def norms_m(self, sensor: str) -> FloatArray:
-        """Length of each residual, m, (n,), in order; n = 0 with fewer than `FEWEST` points."""
+        """Length of each residual, m, (n,), in order; n = 0 with fewer than `FEWEST` points.
+
+        The order is that of recording; n = 0 also if the points do not register the sensor. Raises
+        KeyError for an unknown sensor.
+        """
         return self._fitted(sensor)[0]
 
     def of_registration(self, sensor: str) -> int:
-        """Number of residuals of registration poses, which come first."""
+        """Number of residuals of registration poses, which come first.
+
+        Counted also while there are too few points for residuals. Raises KeyError for an unknown
+        sensor.
+        """
         return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:
-        """Measured points in the robot base, m, (n, 3); n = 0 with fewer than `FEWEST`."""
+        """Measured points in the robot base, m, (n, 3); n = 0 with fewer than `FEWEST`.
+
+        In the order of `norms_m`; n = 0 also if they do not register the sensor. Raises KeyError
+        for an unknown sensor.
+        """
         return self._fitted(sensor)[1]
 
     def _fitted(self, sensor: str) -> tuple[FloatArray, FloatArray]:

@@ -75,7 +75,7 @@ WANTED = 'wanted/'
 def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
     """Wanted positions of a settled arm, before a correction, rad, (k,).
 
-    None without a correction.
+    None without a correction. ``joint_names``: of the arm, whose order the positions have.
 
     Raises InputError as `JointOrder.positions`.
     """

@@ -221,7 +221,7 @@ class Pairing:
     def fail(self, sensor: str, detail: str) -> None:
         """Reject a sensor (``device``), whose device reported that there is no measurement.
 
-        An earlier decision stays.
+        An earlier decision stays. ``detail``: the device's reason.
         """
         self._set(Rejection(sensor, 'device', detail))
 
@@ -341,7 +341,10 @@ class Pairing:
             self._decided_s[item.sensor] = self._now_s
 
     def _reject_undecided(self, reason: str, detail: str) -> None:
-        """Reject all sensors without a decision."""
+        """Reject all sensors without a decision.
+
+        ``reason``: the category, such as ``clock``; ``detail``: one line with the numbers.
+        """
         for name in self.rules:
             self._set(Rejection(name, reason, detail))
 

@@ -169,7 +169,7 @@ class Peers:
         """Present facts for the preflight; raises `InputError` as `required`.
 
         ``seen_before``: whether the sensors have seen their markers in this session, so that the
-        arm may stand where they do not: in a collection that is resumed.
+        arm may stand where they do not: in a collection that is resumed. ``now``: wall time, s.
         """
         required, bridge = self.required(), self.bridge or BridgeState(halted='')
         return Facts(
@@ -185,7 +185,7 @@ class Peers:
         """Facts on a sensor: age of node and reading, s, whether it is ready, and its message.
 
         A sensor without a report is not ready, and its node infinitely old. The age of the reading
-        is 0 for every sensor if `seen_before`, infinite if there was none.
+        is 0 for every sensor if `seen_before`, infinite if there was none. ``now``: wall time, s.
         """
         nothing = SensorReport(sensor=name, ready=False), -NEVER_S
         report, came = self._reports.get(name, nothing)
@@ -200,7 +200,10 @@ class Peers:
         )
 
     def _since_s(self, node: str, now: float) -> float:
-        """Wall time since a node's last state, s; infinite before the first."""
+        """Wall time since a node's last state, s; infinite before the first.
+
+        ``node``: the sender's name; ``now``: wall time, s.
+        """
         heard = self._heard.get(node)
         return NEVER_S if heard is None else now - heard.wall
 

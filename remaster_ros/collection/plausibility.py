@@ -80,7 +80,8 @@ class Plausibility:
         The distances are known for any place of arm and sensor. If a distance is wrong, markers
         were exchanged or a stray was taken for one of them; the distances cannot tell which marker
         is wrong (the distance of two exchanged markers is right). So no reading of the frame is
-        used.
+        used. ``T_R_N``, ``anywhere``: as in `judge`. If a distance is wrong, the list is one
+        Rejection (``swapped``) for the whole frame, else as long as ``readings``.
         """
         for first, second in itertools.combinations(readings, 2):
             nominal = np.subtract(self._markers[first.marker], self._markers[second.marker])

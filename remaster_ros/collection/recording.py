@@ -175,7 +175,7 @@ class Recording:
     def take_solutions(self, stamp: str, solutions: FloatArray) -> None:
         """Process the joint solutions of an announcement, rad, (m, k).
 
-        M = 0 withdraws the pose.
+        With m = 0 the pose is withdrawn.
         """
         self._solutions_stamp = stamp if len(solutions) else ''
         self._solutions = solutions if len(solutions) else None
@@ -212,7 +212,7 @@ class Recording:
         Solutions are wanted joints: if a correction has changed the joints, rad, (k,), the change
         is subtracted first. At an unknown solution, either the planner finds by the recorder's
         state that the pose is not known here and announces it again, or the announcement has not
-        arrived yet.
+        arrived yet. ``stamp_s``: when it settled.
         """
         self._unknown = None
         if self._queue(q, stamp_s, change):
@@ -244,7 +244,7 @@ class Recording:
         """Queue a configuration to be read; False, and nothing, if the pose has no such solution.
 
         False also if no pose is known. ``change``: by a correction, subtracted from q, rad or m,
-        (k,).
+        (k,). ``stamp_s``: when the arm settled.
         """
         pose = self.pose
         if pose is None or self._solutions is None:
@@ -328,7 +328,10 @@ class Recording:
         return self._settled is not None and self._settled.pose == BY_HAND
 
     def end_as_recorded(self, result: str, reason: str) -> None:
-        """Decide the present reading as the recorder of a bag had; see `Pairing`."""
+        """Decide the present reading as the recorder of a bag had; see `Pairing`.
+
+        Nothing if no reading is in progress.
+        """
         if self.pairing is not None:
             self.pairing.end_as_recorded(result, reason)
 

@@ -347,7 +347,9 @@ class ReferenceWatch:
 
         The smallest of several tests, times their number (Bonferroni), half of it for each kind:
         all differences of a sensor, of any form; and the part of all differences that each cause
-        explains, which finds a change in one direction much sooner.
+        explains, which finds a change in one direction much sooner. 1.0 if nothing can be
+        compared. ``number``: index of the round; ``noise``: by sensor; sensors that are missing in
+        it are left out; ``off``: measured minus nominal, m.
         """
         first = [self._begin] if self._begin else [0, 1]
         places, stds, scaled = [], [], []
@@ -388,7 +390,8 @@ class ReferenceWatch:
 
         ``kind`` is 'unexplained' if the best leaves too much (`UNEXPLAINED_P`,
         `UNEXPLAINED_SHARE`). Causes within `LOOKS_ALIKE` of it are look-alikes; a drift must be
-        better by that than a step.
+        better by that than a step. ``number``: index of the round; ``noise``: by sensor;
+        ``p_value``: of `_p_value`, kept in the change.
         """
         rounds = range(self._begin, number + 1)
         keys = [

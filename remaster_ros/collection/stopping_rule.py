@@ -117,7 +117,8 @@ class StoppingRule:
     def limit(self, count: int) -> float:
         """p-value below which a look finds structure; 0 if it makes no test.
 
-        Tests are made at most at `MOST_TESTS` looks, the last one included.
+        Tests are made at most at `MOST_TESTS` looks, the last one included. ``count``: number of
+        configurations at the look.
         """
         step = -(-len(self.counts) // MOST_TESTS)
         tested = self.counts[::-1][::step][::-1]
@@ -153,7 +154,8 @@ class StoppingRule:
     ) -> Look:
         """Judgement of a fit of `count` configurations, each of which took `pace_s`.
 
-        See `look`.
+        See `look`. ``before``: the last look, whose structure is kept, None for the first;
+        ``elapsed_s``: time measured so far; ``rng``: for `Precision.of`.
         """
         goal, measurements = self.goal, found.problem.measurements
         counting = np.ones(len(measurements), bool)
@@ -221,7 +223,8 @@ class StoppingRule:
     def _structure(self, found: Estimate, count: int) -> tuple[StructureTest, ...]:
         """Significant tests of structure, by p-value; () if none is significant or due.
 
-        Significant is below `limit` divided by the number of tests.
+        Significant is below `limit` divided by the number of tests. ``count``: number of
+        configurations at the look.
         """
         limit = self.limit(count)
         if limit == 0.0:

@@ -41,7 +41,11 @@ class Planning(Protocol):
     """Runs one job at a time in the background; see `nodes.background`."""
 
     def ask(self, what: object, q: FloatArray, job: Callable[[], Result]) -> tuple[Result] | None:
-        """Return the result of a job in a tuple; None while it runs."""
+        """Return the result of a job in a tuple; None while it runs.
+
+        Raises what the job raised. ``what``: identifier of the job, equal whenever the same one is
+        asked for; ``q``: configuration of the arm, rad or m, (k,).
+        """
 
 
 class TourProgress:
@@ -194,6 +198,9 @@ class TourProgress:
         self, q: FloatArray, sensors: Collection[str], words: str
     ) -> PoseVisit | None:
         """Begin the next visit of the registration; None while planned, and once registered.
+
+        ``q``: where the arm is, rad or m, (k,); ``sensors``: those to be registered; ``words``:
+        state of the registration, for the error.
 
         Raises InsufficientDataError if all poses were visited without a registration.
         """

@@ -75,7 +75,7 @@ def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
     """Return the number of candidates of each split that leaves `TO_FIT` poses to fit.
 
     At least `asked`; `asked` as well if `MOST_CANDIDATES` are not enough, in which case the
-    planner says why.
+    planner says why. ``seed``: of the planned tour. The smallest such number is returned.
     """
     scene = cell.planning_scene(cell.chain())
     for count in range(asked, MOST_CANDIDATES + 1):
@@ -378,6 +378,9 @@ class Demo:
     def _trigger(self, service: str, server: str, timeout_s: float = ANSWER_WALL_S) -> None:
         """Call a service until it answers, also if its node is killed meanwhile.
 
+        ``server``: name of the node, whose restart has the service called again; ``timeout_s``: s
+        of wall time.
+
         Raises DeviceError if it refuses, or does not answer in time.
         """
         future, process = None, self.processes.pid(server)
@@ -482,7 +485,7 @@ class Demo:
 
         Returns whether the collection goes on: not if the person wants a fit, or nobody is there.
         For the live page the rows so far are fitted meanwhile. Raises DeviceError if nobody is
-        there and nothing was measured.
+        there and nothing was measured. ``halted``: why, as the bridge states it.
         """
         done = self.node.summaries.get('pose_planner', {}).get('configurations_done', '0')
         self._say(f'the arm is halted: {halted}. {done} configurations were measured')

@@ -118,6 +118,8 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
 def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> str:
     """Return the likeliest tool frame, the first of `likely_tips`.
 
+    ``names``: as in `likely_tips`.
+
     Raises InputError as `likely_tips` does, and if the arm goes on behind a prismatic joint that
     `names` does not have.
     """
@@ -134,7 +136,10 @@ def likely_tip(model: UrdfModel, base_link: str, names: Container[str] = ()) -> 
 
 
 def moving_before(model: UrdfModel, base_link: str) -> list[str]:
-    """Return the names of the moving joints between the root and a link, from the root on."""
+    """Return the names of the moving joints between the root and a link, from the root on.
+
+    Moving is any but a fixed one. [] if the link is the root.
+    """
     joints = []
     while (joint := model.parent_joint.get(base_link)) is not None:
         if joint.kind != 'fixed':

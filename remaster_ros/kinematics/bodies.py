@@ -104,7 +104,10 @@ def box(size_m: ArrayLike) -> Shape:
 
 
 def cylinder(radius_m: float, length_m: float) -> Shape:
-    """Return a cylinder along z, centred at the origin."""
+    """Return a cylinder along z, centred at the origin.
+
+    Sizes in m. Raises InputError if one is not positive and finite.
+    """
     radius, length = _positive('cylinder', (radius_m, length_m), 2)
     return Shape('cylinder', np.array([[0, 0, -length / 2], [0, 0, length / 2]]), disc=radius)
 
@@ -143,7 +146,10 @@ def hull(points: ArrayLike) -> Shape:
 
 
 def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
-    """Return sizes as an array (count,); raise InputError if one is not positive and finite."""
+    """Return sizes as an array (count,); raise InputError if one is not positive and finite.
+
+    InputError as well for another number of sizes; ``kind``: the shape's name, for it.
+    """
     array = np.asarray(values, dtype=float)
     if array.shape != (count,) or not np.all((array > 0.0) & (array < np.inf)):
         raise InputError(

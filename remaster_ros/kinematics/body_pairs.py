@@ -274,7 +274,10 @@ class BodyPairs:
         return np.minimum(kept, self.most_kept[pairs])
 
     def on_top(self, extra: float) -> FloatArray:
-        """Return the addition to the clearance of each pair, m, (P,): 0 for contact only."""
+        """Return the addition to the clearance of each pair, m, (P,): 0 for contact only.
+
+        ``extra``: the addition for all other pairs, m.
+        """
         return np.where(self.contact_only, 0.0, extra)
 
     def measure(self, placed: Placed, row: int, pair: int) -> float:

@@ -213,7 +213,10 @@ class CollisionModel:
         return ''
 
     def travel(self, start: FloatArray, end: FloatArray) -> float:
-        """Upper bound on the motion of any body relative to another between configurations, m."""
+        """Upper bound on the motion of any body relative to another between configurations, m.
+
+        ``start``, ``end``: rad or m, (k,). 0 without pairs.
+        """
         return float((self._pairs.levers @ np.abs(end - start)).max(initial=0.0))
 
     def pair_distances(self, q: FloatArray, pairs: IntArray) -> FloatArray:
@@ -245,7 +248,10 @@ class CollisionModel:
         return reasons
 
     def free_mask(self, q: ArrayLike, extra: float = 0.0) -> BoolArray:
-        """Whether each configuration (m, k), rad or m, is free, (m,); see `reasons`."""
+        """Whether each configuration (m, k), rad or m, is free, (m,); see `reasons`.
+
+        ``extra``: added to the clearance, m. Joint limits are not checked.
+        """
         return self.reasons(q, extra) == ''
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
@@ -303,6 +309,8 @@ class CollisionModel:
         """Return a violation of the clearance on a straight path; None if it is free.
 
         Checked in steps in which no body moves by more than `STEP_M` relative to another.
+        ``start``, ``end``: rad or m, (k,), both checked as well; ``extra``: added to the
+        clearance, m. The violation is any, not the first on the path.
         """
         travel = self._pairs.levers @ np.abs(end - start)
         steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
@@ -340,6 +348,7 @@ class CollisionModel:
 
         ``inside``: indices of the steps, (m,); ``is_open``: pairs to check at each, (m, P);
         ``per_step``: upper bound on the change of each pair's distance in one step, m, (P,).
+        ``extra``: added to the clearance, m.
         """
         placed = self._pairs.place(q[inside])
         bounds = self._pairs.lower_bounds(placed)

@@ -143,7 +143,10 @@ class _Search:
         return self._effort <= 0
 
     def is_free(self, a: FloatArray, b: FloatArray) -> bool:
-        """Whether a straight path is free and within the limits; counts as one segment."""
+        """Whether a straight path is free and within the limits; counts as one segment.
+
+        ``a``, ``b``: its ends, rad or m, (k,).
+        """
         self._effort -= 1
         return not self._model.path_trouble(np.array([a, b]), self._extra)
 
@@ -178,7 +181,8 @@ class _Search:
     def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree one step towards a configuration; return the new node, None if blocked.
 
-        From its nearest node, by `REACH_RAD` at most, or to the configuration itself.
+        From its nearest node, by `REACH_RAD` at most, or to the configuration itself. The new node
+        is added to ``tree``; the largest joint counts as distance.
         """
         ways = np.abs(np.array([node.q for node in tree]) - goal)
         distances = np.max(ways / self._model.chain.per_radian, axis=1)
@@ -193,7 +197,8 @@ class _Search:
     def _reach(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree until it reaches a configuration; return the node there.
 
-        None if an obstacle blocks it, or the effort is used up.
+        None if an obstacle blocks it, or the effort is used up. New nodes are added to ``tree``;
+        ``goal``: rad or m, (k,).
         """
         while not self.is_out_of_effort:
             new = self._extend(tree, goal)
@@ -202,7 +207,10 @@ class _Search:
         return None
 
     def shortened(self, way: list[FloatArray], rng: np.random.Generator) -> FloatArray:
-        """Return a free path with corners cut where that is free, (n, k), with the same ends."""
+        """Return a free path with corners cut where that is free, (n, k), with the same ends.
+
+        ``way``: a free path, configurations (k,); at most `_SHORTCUTS` rounds, drawn by ``rng``.
+        """
         path = [np.asarray(q) for q in way]
         self._effort = max(self._effort, 2 * _SHORTCUTS)
         for _ in range(_SHORTCUTS):

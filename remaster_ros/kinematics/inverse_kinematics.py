@@ -498,7 +498,10 @@ def _nearest_lines(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _meeting_point(axes: FloatArray, points: FloatArray) -> tuple[FloatArray, float]:
-    """Return the point nearest to three lines, m, (3,), and its largest distance from one, m."""
+    """Return the point nearest to three lines, m, (3,), and its largest distance from one, m.
+
+    ``axes``: unit vectors; ``points``: one on each line, m; (3, 3) each, a line a row.
+    """
     # Normal equations: the sum of (I - a a^T)(x - o) is zero.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     to_lines = np.einsum('nij,nj->ni', across, points)
@@ -510,6 +513,8 @@ def _may_have_closed_form(axes: FloatArray, origins: FloatArray) -> bool:
     """Return whether three successive axes are parallel, or the first or last three meet.
 
     All of EAIK's decompositions need one of these; for other arms EAIK prints to the terminal.
+    ``axes``: unit vectors, (6, 3); ``origins``: a point on each, m, (6, 3). They meet if within
+    `EXACT`.
     """
     neighbours = np.linalg.norm(np.cross(axes[:-1], axes[1:]), axis=1) < 1e-9
     if np.any(neighbours[:-1] & neighbours[1:]):

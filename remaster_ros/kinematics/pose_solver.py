@@ -53,7 +53,8 @@ def _newton(
 ) -> tuple[FloatArray, FloatArray]:
     """Damped Newton steps of starts q, (n, k), changed in place, towards poses T, (n, 4, 4).
 
-    Returns q and the residuals, (n,), as in `reach_from`.
+    Returns q and the residuals, (n,), as in `reach_from`. ``free``: indices of the joints that may
+    change. At most `_STEPS` steps, in each of which a joint turns by at most `_LONGEST_RAD`.
     """
     residuals = np.full(len(q), np.inf)
     active = np.arange(len(q))

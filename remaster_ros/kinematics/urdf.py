@@ -234,7 +234,10 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
 
 
 def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
-    """Raise InputError for malformed numbers that only `compensation.export` reads."""
+    """Raise InputError for malformed numbers that only `compensation.export` reads.
+
+    Those of mimic and safety_controller; ``where``: the joint in words.
+    """
     for tag, keys in (
         ('mimic', ('multiplier', 'offset')),
         ('safety_controller', ('soft_lower_limit', 'soft_upper_limit')),
@@ -246,6 +249,9 @@ def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
 
 def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
     """Return the unit axis of a joint in its frame, (3,); X if it is not given, URDF's default.
+
+    ``kind``: type of the joint; X for a fixed or floating one, whatever is given; ``where``: the
+    joint in words, for the error. Length: from 1e-6 to 1e6.
 
     Raises InputError if its length is not that of a direction.
     """
@@ -274,7 +280,10 @@ def origin_of(element: ElementTree.Element, where: str) -> FloatArray:
 
 
 def attribute(element: ElementTree.Element, key: str, where: str) -> str:
-    """Return a required attribute; raise InputError, which names `where`, if it is missing."""
+    """Return a required attribute; raise InputError, which names `where`, if it is missing.
+
+    An empty one is missing. ``where``: the element in words.
+    """
     value = element.get(key, '')
     if not value:
         raise InputError(f"URDF: {where} has no attribute '{key}'")
@@ -294,7 +303,10 @@ def numbers(text: str, count: int, what: str) -> FloatArray:
 
 
 def _optional_number(element: ElementTree.Element, key: str, where: str) -> float | None:
-    """Return a number attribute, None if it is missing; InputError if it is malformed."""
+    """Return a number attribute, None if it is missing; InputError if it is malformed.
+
+    ``where``: the element in words, for the error.
+    """
     text = element.get(key)
     return None if text is None else _number(text, f'{key} of {where}', _NO_LIMIT)
 

@@ -65,7 +65,8 @@ class TriggeredSensors:
     def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
         """Report a refusal to the pairing; forget the request if its reading was lost.
 
-        Nothing before the answer, and for `PATIENCE_WALL_S` after it.
+        Nothing before the answer, and for `PATIENCE_WALL_S` after it. ``name``: the sensor;
+        ``now``: wall time, s. A lost reading is then requested again.
         """
         assert shot.future is not None
         response = shot.future.result() if shot.future.done() else None

@@ -271,7 +271,10 @@ class _Outlet(Outlet):
             self._node._by_hand.set_result(ended)
 
     def log(self, level: int, text: str) -> None:
-        """Log a line as error, warning or info; `level` as in `logging`."""
+        """Log a line as error, warning or info; `level` as in `logging`.
+
+        Below WARNING all are info.
+        """
         logger = self._node.get_logger()
         # Separate calls: rclpy refuses a line of code that logs with several severities.
         if level >= logging.ERROR:

@@ -340,8 +340,8 @@ class EmergencyLink:
         """Return why the state of the safety circuit is unknown, or ''.
 
         It is if no message has come, no publisher is left, or the last `PERIODIC` messages came
-        regularly (at most `silence_s` apart) and the next one is late by more than that. ''
-        without a topic.
+        regularly (at most `silence_s` apart) and the silence since exceeds their longest interval
+        by more than that. '' without a topic.
         """
         if not self.topic:
             return ''

@@ -48,7 +48,10 @@ class RvizMarkers:
             self._tf = message, node.create_publisher(message, TF_STATIC, LATCHED)
 
     def _surface(self, number: int, surface: Surface) -> Marker:
-        """Triangle marker of a surface of the arm, coarsened to `MOST_TRIANGLES`."""
+        """Triangle marker of a surface of the arm, coarsened to `MOST_TRIANGLES`.
+
+        ``number``: id of the marker.
+        """
         points, faces = coarser(surface.vertices, surface.faces, MOST_TRIANGLES)
         marker = self._marker('arm', number, Marker.TRIANGLE_LIST, COLORS[surface.role], 1.0)
         if surface.color is not None:

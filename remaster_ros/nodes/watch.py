@@ -273,7 +273,10 @@ class Watch(RemasterNode):
         )
 
     def _on_fit_facts(self, facts: Any) -> None:
-        """Show figures of a fit, unless reading them has failed."""
+        """Show figures of a fit, unless reading them has failed.
+
+        ``facts``: of the reading, or the exception that ended it, which is ignored here.
+        """
         if not isinstance(facts, Exception):
             self.view.take_fit(facts)
 

@@ -189,7 +189,10 @@ class TrackerLink:
         return not self._lost
 
     def count(self, what: str, times: int = 1) -> None:
-        """Add to a number in `counts`, from any thread."""
+        """Add to a number in `counts`, from any thread.
+
+        ``what``: its name; a new one begins at 0.
+        """
         with self._news:
             self.counts[what] += times
 
@@ -260,6 +263,8 @@ class TrackerLink:
     def measure(self, timeout_s: float) -> tuple[Measurement, float]:
         """Measure once: result, and this computer's time midway between start and result, s.
 
+        ``timeout_s``: until the result, s of the link's clock.
+
         Raises LaserTrackerError as `ask`.
         """
         with self._exchange_of(Command.START_MEASUREMENT, 'measurement', timeout_s) as exchange:
@@ -275,6 +280,9 @@ class TrackerLink:
     @contextlib.contextmanager
     def _exchange_of(self, command: Command, what: str, timeout_s: float) -> Iterator[_Exchange]:
         """Context of one command and its answers, with the instrument reserved.
+
+        ``what``: the command in words, for errors; ``timeout_s``: until its last answer, s of the
+        link's clock.
 
         Raises LaserTrackerError (`Status.SERVER_BUSY`) if another command is under way. Packets
         that are left at the end are counted as unexpected.
@@ -367,7 +375,10 @@ class TrackerLink:
         return lambda: self._now() >= end and time.monotonic() >= wall_end
 
     def _check(self, status: int, what: str) -> None:
-        """Raise LaserTrackerError with the status in words unless it is ALL_OK."""
+        """Raise LaserTrackerError with the status in words unless it is ALL_OK.
+
+        ``what``: the command in words.
+        """
         if status != Status.ALL_OK:
             raise LaserTrackerError(
                 f'{self.name}: {what} failed: {describe_status(status)}', status
@@ -679,6 +690,9 @@ class LaserTrackerClient:
 
     def _search(self, command: Command, *values: Value, what: str) -> None:
         """Send a command that searches for the reflector, and count it; counted again if it fails.
+
+        ``what``: the command in words. In time: `_SLEW_S` + ``search_timeout_s`` +
+        ``reply_timeout_s``.
 
         Raises LaserTrackerError if the instrument finds none in time.
         """

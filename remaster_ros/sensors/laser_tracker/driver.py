@@ -86,7 +86,10 @@ class LaserTrackerDriver(TriggeredDriver):
         self.tracker.close()
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Search once if the beam is broken. Raises LaserTrackerError if none is found."""
+        """Search once if the beam is broken. Raises LaserTrackerError if none is found.
+
+        ``expected``: where the reflector should be, m, (3,); None for where the beam points.
+        """
         if self.tracker.status is not TrackerStatus.READY:
             before, self._on = self._on, None
             searches = self._lock(expected)
@@ -123,6 +126,9 @@ class LaserTrackerDriver(TriggeredDriver):
 
     def _lock(self, expected: FloatArray | None) -> int:
         """Lock the reflector if the beam is broken, by one search; number of searches made.
+
+        ``expected``: where it should be, m, (3,), searched narrowly; None for where the beam
+        points.
 
         Raises LaserTrackerError if it is not found.
         """

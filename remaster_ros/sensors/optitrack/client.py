@@ -212,7 +212,8 @@ class NatNetClient(MarkerFollower):
         """Decode one datagram and process it; drop a foreign one, count a malformed one.
 
         Frames count from one source, answers from the command port only: another program on the
-        server's computer could send another version or another marker.
+        server's computer could send another version or another marker. ``received_s``: when it
+        came, s; ``from_data_socket``: else from the command socket.
         """
         looks_like_frame = datagram[:2] == _FRAME_ID
         is_answer = not from_data_socket and sender[1] == self._settings.command_port

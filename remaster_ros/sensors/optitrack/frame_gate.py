@@ -177,7 +177,8 @@ class SourceLock:
         """Count a frame of a source without the lock, as its first one after a silence.
 
         Beyond `REMEMBERED` sources, the one heard longest ago is removed, those never refused
-        first.
+        first. ``now_s``: s of the clock of all calls. A silence is `silence_s`, or `REFUSED_FOR_S`
+        for a refused one.
         """
         known = self._others.get(source)
         patience_s = REFUSED_FOR_S if known is not None and known.simultaneous else self._silence_s
@@ -489,7 +490,8 @@ def _sample(
 ) -> MarkerSample:
     """Sample of a marker in a frame, its age since exposure or arrival at the server, s.
 
-    The age is the server's estimate if it has no clock, and 0 if it sent no times.
+    The age is the server's estimate if it has no clock, and 0 if it sent no times. ``received_s``:
+    when this computer got it, s; ``ticks_per_s``: of the server's clock, 0 for none.
     """
     age_s = max(frame.software_latency, 0.0)
     if ticks_per_s:

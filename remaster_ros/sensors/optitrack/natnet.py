@@ -220,7 +220,10 @@ class Row(Codec):
 
 
 def number(layout: str) -> Row:
-    """Codec of a single number."""
+    """Codec of a single number.
+
+    ``layout``: one format character of `struct`.
+    """
     return Row(layout, lambda rows: list(chain.from_iterable(rows)), lambda value: (value,))
 
 
@@ -896,6 +899,9 @@ def split_datagram(datagram: bytes) -> tuple[int, bytes]:
 
 def join_datagram(message_id: int, payload: bytes = b'') -> bytes:
     """Datagram of a header and a payload.
+
+    ``message_id``: one of `MessageId`, in 16 bits. The header is message_id and the payload's
+    length.
 
     Raises ValueError if the payload is longer than a datagram can be.
     """
