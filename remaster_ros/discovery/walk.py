@@ -14,6 +14,7 @@ these shares.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -73,6 +74,9 @@ MOST_MODELS, NEGLIGIBLE, LEAST_SHARE = 24, 7.0, 1e-3
 NEAREST = 4
 # Exchanges of each block of the best model that are looked at.
 MOST_EXCHANGED = 8
+# Blocks of a best model of which each pair is exchanged, those that it would lose least by leaving
+# out, and causes that are tried as the first of the two in their place.
+WEAKEST, MOST_FIRST = 4, 20
 
 
 Identity = tuple[str, tuple[int, ...], str, str, str, str]
@@ -389,6 +393,9 @@ class Walk:
             for index, first in enumerate((self.bare, self.empty)):
                 self.chains.append(self._chain(first, hot=index > 0))
                 progress(0.5 * (index + 1))
+        better = self._pair_for_pair()
+        if better is not None:
+            self.chains.append(self._chain(better, hot=False))
         changed = self._with_changes(changes) if start is None else []
         if self._refined() or changed:
             first = max([self._best_found, *changed], key=lambda one: one.value)
@@ -403,6 +410,42 @@ class Walk:
     def _best_found(self) -> Evaluated:
         """Best model of all chains so far."""
         return max((chain.best for chain in self.chains), key=lambda one: one.value)
+
+    def _pair_for_pair(self) -> Evaluated | None:
+        """Return a model better than all so far, with two weak blocks of a best one exchanged.
+
+        Two causes may be imitated by two others: each move of a chain on the way from these to
+        those leads through models that are too unlikely. None if no exchange is better.
+        """
+        found = []
+        for best in [chain.best for chain in self.chains]:
+            state = State.of(self._surface(best.noise, best.std), best.model)
+            weakest = np.argsort(state.losses)[:WEAKEST].tolist()
+            gain, model = 0.0, best.model
+            for one, other in itertools.combinations(sorted(weakest, reverse=True), 2):
+                rest = state.without(one).without(other)
+                for block, level in self._likeliest(rest):
+                    more = rest.with_block(block, level)
+                    index = np.unravel_index(np.argmax(more.gains), more.gains.shape)
+                    value = more.value + more.gains[index] - state.value
+                    if value > gain + SETTLED:
+                        gain, model = value, more.with_block(int(index[0]), int(index[1])).key
+            if model != best.model:
+                found.append(self._refitted(model, best, anew=True))
+        better = max(found, key=lambda one: one.value, default=None)
+        if better is None or better.value < self._best_found.value + SETTLED:
+            return None
+        return better
+
+    def _likeliest(self, state: State) -> list[tuple[int, int]]:
+        """Return block and level of the causes that gain most beside a model, one of each."""
+        gain = state.gains.max(axis=1)
+        causes: dict[Identity, int] = {}
+        for block in np.argsort(-gain).tolist():
+            if len(causes) == MOST_FIRST or not np.isfinite(gain[block]):
+                break
+            causes.setdefault(identity(self.pool.blocks[block].candidate), block)
+        return [(block, int(np.argmax(state.gains[block]))) for block in causes.values()]
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
         """Add likely changes to the pool; return best models with the most likely change.

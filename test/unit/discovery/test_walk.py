@@ -12,7 +12,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.surface import LEVELS_M, Pool, State, Surface, Walker, blocks_of
-from remaster_ros.discovery.walk import Walk, evaluated, identity, p_value
+from remaster_ros.discovery.walk import Chain, Walk, evaluated, identity, p_value
 
 ARC_MINUTE = np.radians(1.0 / 60.0)
 NAMES = ('joint_compliance', 'encoder_eccentricity', 'backlash', 'joint_error_curve')
@@ -163,6 +163,25 @@ def test_two_causes_at_once_are_found_with_their_probability():
         assert walk.log_gain([candidate]) > 5.0
     assert walk.share.sum() == pytest.approx(1.0)
     assert walk.best.log_evidence == walk.models[0].value == max(m.value for m in walk.models)
+
+
+def test_two_causes_are_exchanged_for_the_two_that_they_stand_for():
+    """Each of the two alone is worse than nothing, so that no move of a chain leads there."""
+    data = scene()
+    walk = Walk(data, candidates(), np.random.default_rng(1))
+    of = {
+        (c.name, c.joints): index
+        for index, c in enumerate(block.candidate for block in walk.pool.blocks)
+    }
+    model = tuple(sorted((of['backlash', (joint,)], 2) for joint in (3, 5)))
+    wrong = evaluated(walk.pool, [], model)
+    walk.chains = [Chain(wrong, {model: wrong.value})]
+    better = walk._pair_for_pair()
+    assert better is not None
+    found = {(c.name, c.joints) for c in walk.named(better)}
+    assert found == {('joint_compliance', (2,)), ('encoder_eccentricity', (4,))}
+    walk.chains.append(Chain(better, {better.model: better.value}))
+    assert walk._pair_for_pair() is None
 
 
 def test_nothing_is_found_where_nothing_is_hidden():
