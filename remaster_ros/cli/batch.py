@@ -417,7 +417,10 @@ def work_off(
 
 
 def _died(error: Exception) -> bool:
-    """Whether an error means that a worker process has ended, of this computer or of Dask."""
+    """Whether an error means that a worker process has ended.
+
+    BrokenProcessPool for one of this computer, KilledWorker for one of Dask.
+    """
     return isinstance(error, BrokenProcessPool) or type(error).__name__ == 'KilledWorker'
 
 

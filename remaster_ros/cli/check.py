@@ -317,7 +317,11 @@ def _next_date(found: CheckResult) -> str | None:
 
 
 def _next_in_words(found: CheckResult) -> str:
-    """Sentence on the next check: a date if times are known, else a number of usual intervals."""
+    """Sentence on the next check: a date if `_next_date` has one.
+
+    Else after so many usual intervals (`next_in`, rounded up), or, if that is 1, to go on as
+    usual.
+    """
     if (date := _next_date(found)) is not None:
         return f'Next check on {date}.'
     if (more := math.ceil(found.next_in)) > 1:

@@ -113,7 +113,10 @@ def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) ->
 
 
 def _chain(session: Session) -> SerialChain:
-    """Return the arm of the session."""
+    """Return the arm of the session, from its URDF, base and tip.
+
+    Raises InputError as `SerialChain.from_urdf`.
+    """
     return SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
 
 

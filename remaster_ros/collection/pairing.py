@@ -410,8 +410,8 @@ class Pairing:
     ) -> tuple[float, dict[str, list[MarkerReading]]] | None:
         """End of a measurement and each marker's readings in it; None while it lasts.
 
-        Markers with too few readings up to the end are left out, unless all have too few. With
-        ``waits`` False a marker without a reading is hidden.
+        Markers with fewer than `min_samples` readings up to the end are left out, unless all have
+        fewer. With ``waits`` False a marker without a reading is hidden.
         """
         if not self._readings[rules.sensor]:
             return None

@@ -74,6 +74,6 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _share(numerator: FloatArray, denominator: FloatArray) -> FloatArray:
-    """Return numerator / denominator clipped to [0, 1]; 0 if the denominator is about 0."""
+    """Return numerator / denominator clipped to [0, 1]; 0 if the denominator is 1e-15 or less."""
     safe = np.where(denominator > 1e-15, denominator, 1.0)
     return np.clip(np.where(denominator > 1e-15, numerator / safe, 0.0), 0.0, 1.0)

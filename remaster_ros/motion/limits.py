@@ -96,7 +96,10 @@ class MotionLimits:
 
     @property
     def margins(self) -> FloatArray:
-        """Margin to the limits of each joint, rad or m, (k,); (1,) if all joints turn."""
+        """Margin to the limits of each joint: `margin` times `units.per_radian`, rad or m.
+
+        (k,), or (1,) if all joints turn.
+        """
         return self.margin * self.units.per_radian
 
     def shown(self, joint: int, low: float, high: float) -> str:

@@ -58,7 +58,7 @@ class Visit:
 
     @property
     def trajectory(self) -> Trajectory:
-        """Trajectory that was sent."""
+        """Trajectory that was sent to the controller, that of `following`."""
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:

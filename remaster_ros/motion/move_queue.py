@@ -70,7 +70,10 @@ class MoveQueue:
         self.found(Finding.CLEARED if self._way_out is None else Finding.ALLOWED)
 
     def take_way_out(self) -> FreePath:
-        """Return the way out that is allowed, once; there must be one."""
+        """Return the way out that is allowed, once; it is no longer allowed then.
+
+        There must be one, else AssertionError.
+        """
         path, self._way_out = self._way_out, None
         assert path is not None
         self.found(Finding.LEFT)
@@ -83,7 +86,7 @@ class MoveQueue:
 
     @property
     def refused(self) -> str:
-        """Why the next configuration must not be commanded; ''."""
+        """Why the next configuration was refused and must not be commanded; '' if it was not."""
         return self._refused.get(self.next, '')
 
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:

@@ -105,6 +105,9 @@ class SettleDetector:
 
     @property
     def mean(self) -> FloatArray:
-        """Mean reported position since the arm stands still, rad or m, (k,); it must stand."""
+        """Mean reported position since the arm stands still, rad or m, (k,).
+
+        The arm must stand still, else AssertionError.
+        """
         assert self._still is not None
         return self._still.total / self._still.count

@@ -762,7 +762,7 @@ class RobotBridge(RemasterNode):
     def _tell_missed(self) -> None:
         """Publish and log that the arm stops if pieces of its move have come too late.
 
-        Nothing if none has since the last call.
+        Counted in ``stopped``. Nothing if none has since the last call.
         """
         if self.supervisor.missed == self._missed:
             return

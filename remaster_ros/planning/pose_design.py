@@ -315,8 +315,9 @@ class _Search:
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
         """Whether each unit brings the design nearer to the floors, (n,).
 
-        A new pose while poses are few; a pose with one chosen solution, or whole with several,
-        while repeated ones are.
+        A new pose while there are fewer than `poses` of the floors; while fewer than `repeated`
+        have several solutions chosen, one more solution of a pose with a single one, or, with
+        whole poses, only a new pose with several.
         """
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)

@@ -278,7 +278,7 @@ class Tour:
     def accept(self, proposed: PoseVisit) -> PoseVisit:
         """Count a proposed visit as made, and return it with its number.
 
-        It must be of the present state of the tour.
+        Not checked: the tour must be in the state in which the visit was proposed.
         """
         p = proposed
         return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached)

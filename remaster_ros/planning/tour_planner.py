@@ -274,8 +274,9 @@ class TourPlanner:
         """Return a tour of new poses, each with the correction off and on in random order.
 
         The random order keeps drift out of the difference. The sensors are assumed at their rough
-        positions; no registration is needed.
-        Raises InsufficientDataError if too few of the candidates can be reached from one another.
+        positions; no registration is needed. One solution of each pose is visited. Raises
+        InsufficientDataError if fewer than `VERIFIED_POSES` of `VERIFIED_CANDIDATES` candidates
+        can be reached from one another.
         """
         rng = np.random.default_rng([self._seed, *b'verify'])
         plan = self.scene.plan(VERIFIED_CANDIDATES, self.scene.rough_R, rng)
@@ -297,9 +298,11 @@ class TourPlanner:
         )
 
     def check(self, q: FloatArray) -> Tour:
-        """Return a tour through configurations q, rad, (n, k), in their order.
+        """Return a tour through configurations q, rad or m, (n, k), in their order.
 
-        Raises InputError if a configuration is in collision or too near to a joint limit.
+        Raises InputError, which names the first by its number from 1, if a configuration is in
+        collision (clearance and `RESERVE_M`) or nearer to a joint limit than the scene's
+        `limit_margin_rad`.
         """
         margin = self.scene.limit_margin_rad * self._chain.per_radian
         for number, (each, why) in enumerate(zip(q, self.model.reasons(q, RESERVE_M)), 1):

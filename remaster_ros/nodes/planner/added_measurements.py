@@ -66,7 +66,7 @@ class AddedMeasurements:
     def _digest(self) -> str:
         """Return the SHA-256 of the session's table of observations, as hexadecimal text.
 
-        Raises InputError if the table is missing or too large.
+        Raises InputError if the table is missing or larger than `OBSERVATIONS_LIMIT`.
         """
         rows = read_limited(self._session / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
         return hashlib.sha256(rows).hexdigest()

@@ -92,7 +92,10 @@ class PosePublisher:
         return key
 
     def repeat(self, status: NodeStatus) -> None:
-        """Publish the last announcement again, unchanged, event first; there must be one."""
+        """Publish the last announcement again, unchanged, its event first.
+
+        There must be one, else AssertionError.
+        """
         assert self._event is not None
         # The event first: the recorder needs the pose before the arm arrives.
         status.event(self._event)

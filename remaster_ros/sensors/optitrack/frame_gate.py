@@ -399,8 +399,10 @@ class MarkerGate:
     def _order(self, frame: Frame) -> Dropped | None:
         """Reason to drop a frame (not live, duplicate, out of order, stale), or None.
 
-        Counts lost frames and restarts, and remembers the frame: called once per frame. A large
-        step of the number or back in time is a restart of the server.
+        Counts lost frames and restarts, and remembers the frame: called once per frame. A restart
+        of the server is a number ahead by more than `MOST_LOST` or behind by more than
+        `REORDER_WINDOW`, or a timestamp that goes back by more than `RESTART_S`; stale is one that
+        does not advance.
         """
         if frame.params & NOT_LIVE:
             return Dropped.NOT_LIVE

@@ -393,7 +393,7 @@ class MarkerFollower(ABC):
     def _release_silent_source(self) -> bool:
         """Release the lock after a silence of its source, with a warning; whether it was released.
 
-        The server must answer before the next lock.
+        As `SourceLock.release_if_silent`: the server must answer before the next lock.
         """
         holder = self._lock.source
         if holder is None or not self._lock.release_if_silent(time.monotonic()):

@@ -312,7 +312,10 @@ class Columns(Codec):
             kind.skip_many(reader, count)
 
     def write(self, item: Sequence[Sequence[Any]]) -> bytes:
-        """Bytes of the columns; there must be one, and all equally long."""
+        """Bytes of the number of rows and of the columns, one after the other.
+
+        Not checked: there is a column, and all are equally long. IndexError without one.
+        """
         columns = [map(kind.write, column) for kind, column in zip(self._kinds, item)]
         return _COUNT.pack(len(item[0])) + b''.join(chain(*columns))
 
@@ -671,8 +674,8 @@ def decode_model_definition(payload: bytes, version: Version) -> ModelDefinition
 def encode_model_definition(definition: ModelDefinition, version: Version) -> bytes:
     """Payload of a MODELDEF message.
 
-    Raises ProtocolError if the version is unknown; ValueError if a name is too long, or a
-    description is of a kind whose details are not kept.
+    Raises ProtocolError if the version is unknown; ValueError if a name has a NUL or over 255
+    bytes, or a description is of a kind whose details are not kept.
     """
     require_supported(version)
     descriptions = [_write(description, version) for description in definition.descriptions]
