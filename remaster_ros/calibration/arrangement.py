@@ -226,7 +226,7 @@ def between(m: Measurements, since: int | None, until: int | None) -> BoolArray:
 
 
 def _row_of(m: Measurements, observation: int) -> int:
-    """Index of the first row of an observation; the number of rows if there is none."""
+    """Index, from 0, of an observation's first row; the number of rows without one."""
     found = np.flatnonzero(m.observation == observation)
     return int(found[0]) if len(found) else len(m)
 

@@ -112,7 +112,10 @@ def _normal_scores(draws: FloatArray) -> FloatArray:
 
 
 def _split_r_hat(draws: FloatArray) -> FloatArray:
-    """R-hat (eq. 1 to 4) of chains (c, n, p), (p,)."""
+    """R-hat (eq. 1 to 4 of Vehtari et al. 2021) of chains (c, n, p), (p,); NaN if constant.
+
+    `_halves` has split the chains before.
+    """
     n = draws.shape[1]
     within = np.var(draws, axis=1, ddof=1).mean(axis=0)
     between = np.var(draws.mean(axis=1), axis=0, ddof=1)

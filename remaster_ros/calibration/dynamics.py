@@ -101,7 +101,10 @@ class MotionColumns:
         return MovingLinks.of(self.chain, self.q, self.velocity, self.acceleration)
 
     def jacobian(self, places: FloatArray) -> FloatArray:
-        """Derivative of markers at positions in the tool frame by the joints, (n, 3, k)."""
+        """Derivative of markers at positions in the tool frame, (n, 3), by the joints, (n, 3, k).
+
+        m/rad, or 1 for a joint that slides, in R.
+        """
         return self.chain.position_jacobian(self.q, places)
 
     @cached_property

@@ -141,7 +141,7 @@ class Extension:
 
 
 def _product(values: FloatArray, theta: FloatArray) -> FloatArray:
-    """Product of values (n, ..., c) and theta (draws..., c): (draws..., n, ...)."""
+    """Product of values (n, ..., c) and theta (draws..., c) over c: (draws..., n, ...)."""
     c = values.shape[-1]
     product = theta.reshape(-1, c) @ values.reshape(-1, c).T
     return product.reshape(*theta.shape[:-1], *values.shape[:-1])

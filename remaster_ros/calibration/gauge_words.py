@@ -109,7 +109,10 @@ def in_words(model: Model, direction: FloatArray) -> str:
 
 
 def combination_text(model: Model, direction: FloatArray) -> str:
-    """Parameters of a direction (size,) that are not 0, with their values, as text."""
+    """Parameters of a direction (size,) that are not 0, with their values, as text.
+
+    'a (+0.5), b (-0.5) together'; more than 20 are shortened.
+    """
     moved = [
         f'{name} ({value:+.3g})'
         for name, value in zip(model.names, direction, strict=True)

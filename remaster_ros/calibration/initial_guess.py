@@ -341,7 +341,7 @@ def _refined(
 
 
 def _squares(errors: FloatArray) -> FloatArray:
-    """Squared lengths of errors, (n,)."""
+    """Squared lengths of errors (n, 3), (n,)."""
     return np.einsum('ni,ni->n', errors, errors)
 
 

@@ -106,7 +106,10 @@ class Mode:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance of the free pinned parameters at the mode's noise, (f, f)."""
+        """Covariance of the free pinned parameters at the mode's noise, (f, f).
+
+        The noise's own uncertainty is not in it.
+        """
         root = np.linalg.inv(self.linearisation.whitened(self.eta)[0])
         return root.T @ root
 
@@ -235,7 +238,10 @@ def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatAr
 
 
 def _noise_guess(posterior: Posterior) -> FloatArray:
-    """Coordinates of the noise, (e,), from the errors at the reference."""
+    """Coordinates of the noise, (e,), from the errors at the posterior's reference.
+
+    In the order of noise coordinates: logarithms of sigma, then the ratios of the common parts.
+    """
     errors = posterior.rows.target - posterior.model.predict(posterior.reference, posterior.rows)
     noise = posterior.noise_model
     sums = noise.sums_of_squares(errors)

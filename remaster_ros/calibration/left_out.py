@@ -66,7 +66,7 @@ class Contrasts:
         return cls(measurements.pose[rows.source], kind, formed[..., :-1], formed[..., -1])
 
     def gram(self, kind: int) -> FloatArray:
-        """Gram matrix of [derivative | error] of one ``kind``, (f + 1, f + 1)."""
+        """Gram matrix of [derivative | error] of the contrasts of one ``kind``, (f + 1, f + 1)."""
         of_kind = self.kind == kind
         both = np.concatenate((self.derivative[of_kind], self.errors[of_kind][..., None]), axis=2)
         flat = both.reshape(-1, both.shape[2])
@@ -227,7 +227,7 @@ def held_out_tests(
 
 
 def _contrasts(mode: Mode, measurements: Measurements, rows: Rows) -> Contrasts:
-    """Contrasts of rows, (n,), at a mode, in units of its noise."""
+    """Contrasts of rows, n, at a mode, in units of its noise: whitened derivative and error."""
     white = whitened(mode, rows, {})
     joined = np.concatenate((white['model'], white['errors']), axis=2)
     return Contrasts.of(rows, measurements, joined)

@@ -21,7 +21,7 @@ from remaster_ros.types import FloatArray
 
 
 def linearise(posterior: Posterior, z: FloatArray) -> Linearisation:
-    """Posterior with the predictions replaced by their tangent at z (size,)."""
+    """Posterior with the predictions and priors replaced by their tangents at z (size,)."""
     model, free = posterior.model, posterior.free
 
     def joined(rows: Rows, _: slice) -> FloatArray:

@@ -171,7 +171,7 @@ class Model:
         return np.concatenate((joint_offsets, corrections, np.ravel(markers), turns, theta0))
 
     def offsets(self, x: FloatArray) -> FloatArray:
-        """Joint offsets, rad, (..., k)."""
+        """Joint offsets, rad or m, (..., k), of parameters x (..., size); a view."""
         return x[..., : self.joints]
 
     def markers(self, x: FloatArray) -> FloatArray:
@@ -184,13 +184,13 @@ class Model:
         return part.reshape(*x.shape[:-1], len(self.marker_names), 3)
 
     def R_T_B(self, x: FloatArray) -> FloatArray:
-        """Orientations of the bodies on the tool, (..., bodies, 3, 3), of natural parameters."""
+        """Orientations of the bodies on the tool, R_T_B, (..., bodies, 3, 3), of natural x."""
         turns = x[..., self.markers_end : self.core]
         turns = turns.reshape(*x.shape[:-1], len(self.bodies), 3)
         return np.asarray(rotation_vector_to_matrix(turns) @ self.body_reference)
 
     def theta(self, x: FloatArray) -> FloatArray:
-        """Parameters of the extension, (..., m)."""
+        """Parameters of the extension, (..., m), of parameters x (..., size); a view."""
         return x[..., self.core :]
 
     def corrections(self, x: FloatArray) -> FloatArray:
@@ -205,11 +205,14 @@ class Model:
         return transform(turn, shift)
 
     def T_R_N(self, x: FloatArray) -> FloatArray:
-        """Registrations, (..., sensors, 4, 4), of natural parameters (..., size)."""
+        """Registrations T_R_N, (..., sensors, 4, 4), of natural parameters (..., size)."""
         return inverse(self.corrections(x)) @ self.reference
 
     def with_corrections(self, x: FloatArray, corrections: FloatArray) -> FloatArray:
-        """Copy of parameters x (..., size) with the corrections C, (..., sensors, 4, 4)."""
+        """Copy of natural parameters x (..., size) with the corrections C, (..., sensors, 4, 4).
+
+        C: transforms of points in R, see `corrections`.
+        """
         shift = apply(corrections, self.centroid) - self.centroid
         turn = matrix_to_rotation_vector(corrections[..., :3, :3])
         parts = np.concatenate((shift, turn), axis=-1)
@@ -251,7 +254,7 @@ class Model:
         return result
 
     def _transform_of_first_joint(self, amount: FloatArray) -> FloatArray:
-        """Transform in R by joint 1 moving by an amount (...), (..., 4, 4)."""
+        """Transform in R by joint 1 moving by an amount (...), rad or m, (..., 4, 4)."""
         return _transform_about_axis(*self.base_axis, amount, bool(self.chain.slides[0]))
 
     @cached_property
@@ -331,7 +334,10 @@ class Model:
     def _turns(
         self, x: FloatArray, offsets: FloatArray, rows: Rows, corrections: FloatArray
     ) -> FloatArray:
-        """Rotation vectors from measured to modelled orientations, rad, (..., r, 3)."""
+        """Rotation vectors from measured to modelled orientations, rad, (..., r, 3), in R.
+
+        Of the r rows with orientations; `offsets`: (..., k), `corrections`: (..., sensors, 4, 4).
+        """
         assert rows.turned is not None
         assert rows.body is not None
         start = rows.points
@@ -350,7 +356,10 @@ class Model:
         return _rotation_vector(R_R_B @ np.swapaxes(rows.turned, -1, -2))
 
     def _sensor(self, rows: Rows, index: int) -> int:
-        """Sensor of a span of positions or orientations."""
+        """Index of the sensor of a span of rows, by the span's index.
+
+        Spans of positions have the index of their sensor; those of orientations come behind them.
+        """
         count = len(self.sensor_names)
         return index if index < count else rows.turning[index - count]
 

@@ -142,7 +142,7 @@ def _unexplained(values: FloatArray, columns: FloatArray) -> float:
 
 
 def _criterion_of(means: FloatArray, columns: FloatArray) -> float:
-    """Criterion of means (n, 3) explained by columns (n, p) and a constant."""
+    """Criterion of means (n, 3) explained by columns (n, p) and a constant; smaller is better."""
     return _criterion(_unexplained(means, columns), columns.shape[1] + 1, len(means))
 
 

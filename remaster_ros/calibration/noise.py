@@ -57,7 +57,7 @@ class Channel:
 
     @property
     def dimension(self) -> int:
-        """Number of axes."""
+        """Number of axes of the channel: 1 along or 2 across the line of sight, or 3."""
         return self.axes[1] - self.axes[0]
 
 
@@ -223,12 +223,18 @@ class NoiseModel:
 
     @cached_property
     def size_of(self) -> FloatArray:
-        """Factor of pose_sigma² in the variance of each error group, (error groups,); 0 or m M."""
+        """Factor of pose_sigma² in the variance of each error group, (error groups,).
+
+        The number of rows of a pose for groups of kind 'poses', else 0.
+        """
         return np.array([group.size for group in self.error_groups])
 
     @cached_property
     def frame_size_of(self) -> FloatArray:
-        """Factor of frame_sigma² in the variance of each error group, (error groups,); 0 or M."""
+        """Factor of frame_sigma² in the variance of each error group, (error groups,).
+
+        The mean number of rows of a frame; 0 for groups of kind 'rows'.
+        """
         return np.array([group.frame_size for group in self.error_groups])
 
     @cached_property
@@ -384,7 +390,10 @@ class NoiseModel:
 
     @cached_property
     def contained(self) -> dict[int, list[int]]:
-        """Error groups of kind 'frames' -> the groups contained in their sums (indices)."""
+        """Error groups of kind 'frames' -> error groups contained in their sums (indices).
+
+        These are of kind 'poses' and are subtracted from the sums of squares.
+        """
         return {
             index: [
                 other

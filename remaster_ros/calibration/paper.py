@@ -100,7 +100,10 @@ class PaperPosterior:
         return correction @ initial, offsets, 1e-3 * states[..., -self.sensors :]
 
     def log_density(self, states: FloatArray) -> FloatArray:
-        """Logarithm (chains,) of eq. 15 at states (chains, d); -inf for sigma <= 0."""
+        """Logarithm (chains,) of eq. 15 at states (chains, d), up to a constant.
+
+        -inf where a sigma is not above 0.
+        """
         T_N_R, offsets, sigma = self.split(states)
         points = self.chain.positions(
             self.rows.q, self.markers[self.rows.marker], offsets[:, None, :]

@@ -64,7 +64,10 @@ class PathNoise:
     order: IntArray  # Of Matérn's family, an index into `ORDERS`
 
     def of_frames(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Correlations of frames, (f, f); ``rows``: index of one row of each frame."""
+        """Correlations of the errors of frames of a sensor (index), (f, f), 1 on the diagonal.
+
+        ``rows``: index of one row of each frame.
+        """
         return self._correlations(sensor, rows, float(self.share[sensor]), 1.0)
 
     def of_markers(self, sensor: int, rows: IntArray) -> FloatArray:

@@ -81,7 +81,7 @@ class Posterior:
         return tuple(self.model.names[index] for index in self.free)
 
     def with_independent_rows(self) -> Posterior:
-        """Posterior under noise that is independent between all rows."""
+        """Posterior under noise that is independent between all rows: no pose or frame parts."""
         return replace(self, noise_model=replace(self.noise_model, separable=(), framed=()))
 
     @property
@@ -108,7 +108,11 @@ class Posterior:
         return self.noise_model.variances(self.noise(eta))
 
     def log_noise_prior(self, eta: FloatArray) -> FloatArray:
-        """Log prior density (...) of noise coordinates (..., e), up to a constant."""
+        """Log prior density (...) of noise coordinates (..., e), up to a constant.
+
+        Flat in log sigma above the sensors' resolution; half-Cauchy in the ratios of the common
+        parts.
+        """
         count = len(self.noise_model.channels)
         # A half-normal wall at the resolution instead of a jump: as good as one pseudo-reading.
         wall = 0.5 * np.sum((RESOLUTION_M * np.exp(-eta[..., :count])) ** 2, axis=-1)

@@ -153,7 +153,11 @@ class Precision:
     def _shortfall(
         self, covariance: FloatArray, joint_std: float | None, tool_std: float | None
     ) -> float:
-        """Largest ratio of std to wanted std by a covariance (f, f); 0 if none is wanted."""
+        """Largest ratio of std to wanted std by a covariance (f, f); 0 if none is wanted.
+
+        ``joint_std``: wanted RMS of the offsets; ``tool_std``: of the markers' error, m; None for
+        no wish.
+        """
         joints = 0.0 if joint_std is None else self._joint_rms(covariance) / joint_std
         tool = 0.0 if tool_std is None else self._tool_rms(covariance) / tool_std
         return max(joints, tool)

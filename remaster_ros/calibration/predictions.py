@@ -73,7 +73,10 @@ class Coverage(Struct, frozen=True):
 
     @classmethod
     def of(cls, inside: BoolArray) -> Coverage:
-        """Coverage of rows inside or outside their regions, (n,)."""
+        """Share of rows in their regions, with its 95 % interval; None for both without rows.
+
+        ``inside``: whether each row is in its region, (n,). The interval is Clopper and Pearson's.
+        """
         rows, count = len(inside), int(inside.sum())
         if rows == 0:
             return cls(0, 0, None, None)

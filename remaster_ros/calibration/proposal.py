@@ -179,14 +179,14 @@ class AdaptedProposal:
         return np.concatenate((white, eta), axis=1), log_determinant(factor), marginal
 
     def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`Linearisation.conditional` of noise (n, e), clipped near the mode."""
+        """`Linearisation.conditional` of noise (n, e), clipped `FARTHEST` from the mode."""
         # Outside, rounding removes the information. A proposal may use any function of the noise.
         near = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
         return self.mode.linearisation.conditional(near)
 
     @property
     def _block(self) -> int:
-        """Number of draws in a block, at least 1: each draw has a matrix (d, d)."""
+        """Number of draws in a block, at least 1: each draw has a matrix (d, d) in memory."""
         return max(1, BLOCK_ENTRIES // self.dimension**2)
 
     def _log_density(self, inner: FloatArray) -> FloatArray:

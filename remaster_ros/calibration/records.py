@@ -24,7 +24,7 @@ class Robot(Struct):
 
     @classmethod
     def of(cls, session: Session, chain: SerialChain) -> Robot:
-        """Robot of a session."""
+        """Robot of a session: names of arm, links and joints, and checksum of its URDF."""
         return cls(
             chain.name,
             session.urdf_sha256,

@@ -81,7 +81,10 @@ class StructureTest(Struct, frozen=True):
         return 'p < 0.0001' if self.p_value < 1e-4 else f'p = {self.p_value:.4f}'
 
     def words(self, timed: bool = True) -> str:
-        """What the residuals depend on, as text; ``timed``: whether the readings have times."""
+        """What the residuals depend on, as a clause; ``timed``: whether the readings have times.
+
+        Without times they follow 'the order of the rows'.
+        """
         where = 'from pose to pose' if self.between_poses else 'within the poses'
         of_sensor = f' of {self.sensor}' if self.sensor else ''
         if self.driver == 'held_out':

@@ -315,7 +315,10 @@ class FitResult:
 
     @property
     def accuracy(self) -> Mapping[str, Any]:
-        """The three metrics before and after, by split, as fit.json has them."""
+        """The three metrics before and after, by split ('optimization', 'validation').
+
+        In the form of fit.json; see `Comparison`.
+        """
         return self.comparison.accuracy
 
     @property
@@ -432,7 +435,10 @@ def sampled_columns(
 
 
 def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
-    """Names of the columns of `sampled_columns`."""
+    """Names of the columns of `sampled_columns`: moved parameters, then sigmas of the noise.
+
+    ``moved``: indices of the moved parameters.
+    """
     model, noise_model = posterior.model, posterior.noise_model
     noises = [
         '.'.join(filter(None, ('noise', posterior.noise_names[channel.sensor], channel.direction)))

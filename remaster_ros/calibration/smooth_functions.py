@@ -92,7 +92,10 @@ def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
 
 
 def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> FloatArray:
-    """Polynomials of time, s, (n,), without the constant, (n, 3, 3 degree sensors)."""
+    """Polynomials of time, s, (n,), without the constant, separate for sensors and axes.
+
+    Legendre polynomials over the range of times, up to the degree: (n, 3, 3 degree sensors).
+    """
     return _by_sensor(rows, _polynomials(seconds, degree))
 
 

@@ -94,7 +94,7 @@ class Function:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Range of the driver in which the splines are defined."""
+        """Lowest and highest value of the driver at which the splines are defined, in its unit."""
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
     def _in_turn(self, values: FloatArray) -> FloatArray:
@@ -137,7 +137,7 @@ class Geometry:
 
     @classmethod
     def none(cls, joints: int) -> Geometry:
-        """Geometry of an arm of this number of joints without a change."""
+        """Geometry of an arm of this number of joints without a change: all zeros."""
         return cls(np.zeros((joints + 1, 3)), np.zeros((joints + 1, 3)))
 
     @property
@@ -240,7 +240,7 @@ class ArmModel:
 
     @cached_property
     def _needs(self) -> set[str]:
-        """Drivers that the terms need; 'lateral' if a bearing is compliant."""
+        """Drivers that the terms need, by name, with 'lateral' if a bearing is compliant."""
         drivers: set[str] = {term.function.driver for term in self.joint_terms}
         drivers |= {term.function.driver for term in self.base_terms}
         return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
@@ -322,7 +322,7 @@ class ArmModel:
         return replace(self.chain, T_fixed=origins).with_offsets(self.joint_offsets)
 
     def _state(self, drivers: Drivers) -> State:
-        """State of the arm at values of the drivers."""
+        """State of the arm at n values of the drivers: angles with all terms, frames in R."""
         n, k = drivers.q.shape
         angles = drivers.q + self.added_angles(drivers)
         turned = self.chain.motions(angles)
@@ -362,7 +362,10 @@ class ArmModel:
 
     @staticmethod
     def _base_features(drivers: Drivers, term: BaseTerm) -> FloatArray:
-        """Rotation about each axis for a unit coefficient, rad, (n, 3)."""
+        """Rotation about each axis of R for a unit coefficient, rad, (n, 3).
+
+        The base moment, N m, for that driver; else the term's function, alike for all axes.
+        """
         if term.function.driver == 'gravity_moment':
             return drivers.base_moment
         return np.repeat(term.function.features(drivers.of(term.function)), 3, axis=1)
@@ -551,7 +554,10 @@ class ArmModel:
         return transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
 
     def in_sensor(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Position of a marker in the frame N of a sensor, m, (n, 3)."""
+        """Position of a marker in the frame N of a sensor, m, (n, 3), without noise.
+
+        Raises KeyError for an unknown sensor or marker.
+        """
         return apply(inverse(self.T_R_N[sensor]), apply(state.tool, self.markers[marker]))
 
 

@@ -532,7 +532,10 @@ def _days(checks: Sequence[Measured]) -> tuple[FloatArray, bool]:
 
 
 def _before_and_after(T: int, at: int) -> FloatArray:
-    """Weights (T,) whose sum with results is the change of their mean before result `at`."""
+    """Weights (T,) whose sum with results is their mean from `at` on less that before `at`.
+
+    For ``at`` 0 the mean of all.
+    """
     weights = np.full(T, 1.0 / (T - at))
     weights[:at] = -1.0 / at if at else 0.0
     return weights
@@ -582,7 +585,10 @@ def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
 
 
 def _single_column_sizes(columns: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Least-squares size of each column by itself, (k,); 0 for a column of rounding errors."""
+    """Least-squares size of each column (n, k) in residuals (n,) by itself, (k,).
+
+    0 for a column of rounding errors: its square is below 1e-18 of the largest.
+    """
     squares = np.sum(columns**2, axis=0)
     is_any = squares > 1e-18 * np.max(squares)
     return np.divide(columns.T @ residuals, squares, out=np.zeros_like(squares), where=is_any)

@@ -269,7 +269,11 @@ class Compensator:
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
-        """Nominal robot's angles minus reported angles, rad, (n, k)."""
+        """Nominal robot's angles minus reported angles, rad or m, (n, k), for the same tool pose.
+
+        ``warming``: of the arm, K, (n,). No joint is changed by more than ``most_rad``, or its own
+        error if that is larger.
+        """
         added = self.model.added_angles(self.model.drivers(reported, warming))
         added /= self.model.chain.per_radian
         budget = np.maximum(self.most_rad, np.abs(added))

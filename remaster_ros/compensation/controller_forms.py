@@ -223,7 +223,7 @@ def _of_geometry(name: str) -> str:
 
 
 def _models_without_parts(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
-    """Names of the parts that a form does not hold, each with the model without it."""
+    """Names of the parts that a form does not hold, each with the whole model without it."""
     names, none = model.chain.joint_names, Geometry.none(model.joints)
     found = []
     for effect, joint in dict.fromkeys((term.effect, term.joint) for term in model.joint_terms):
@@ -515,7 +515,7 @@ def _number(text: str, path: Path, joint: str) -> float:
 
 
 def _json(compensation: Compensation, held_content: HeldByForm) -> str:
-    """Text of kinematics.json."""
+    """Text of kinematics.json: robot, steps of each table, what is left out, and rows."""
     robot = compensation.content.robot
     content = {
         'format': KINEMATICS_FORMAT,
@@ -543,7 +543,7 @@ def _json(compensation: Compensation, held_content: HeldByForm) -> str:
 
 
 def _csv(held_content: HeldByForm) -> str:
-    """Text of kinematics.csv."""
+    """Text of kinematics.csv: the rows of the tables below a header, a joint or frame each."""
     text = io.StringIO()
     writer = csv_writer(text, lineterminator='\n')
     rows = [asdict(row) for row in tables(held_content.model)]
@@ -651,7 +651,11 @@ def _dh(
 
 
 def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, float]]]:
-    """Screws of the joints and home pose as rows of table, part and values."""
+    """Screws of the joints and home pose as rows of table, part (joint or 'home') and values.
+
+    A screw is wx … wz, vx … vz, its rotation axis and velocity of the base's origin, m; a home
+    pose as in `_placed`.
+    """
     rows = []
     for name, w, point, slides in zip(names, axes.along, axes.points, axes.slides, strict=True):
         turns = [*w.tolist(), *np.cross(point, w).tolist()]
@@ -662,6 +666,6 @@ def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, fl
 
 
 def _placed(T: FloatArray) -> dict[str, float]:
-    """Position and roll, pitch, yaw of a pose, by name."""
+    """Position, m, and roll, pitch, yaw, rad, of a pose (4, 4), by 'x', 'y', 'z', 'roll', …."""
     values = (*T[:3, 3].tolist(), *rpy_of(T[:3, :3]))
     return dict(zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), values, strict=True))

@@ -198,21 +198,37 @@ class Compensation:
         return self.compensator.model
 
     def command(self, q: Any, temperature_c: Any = None) -> FloatArray:
-        """See `Compensator.command`."""
+        """Joint angles to command so that the tool is where the nominal robot has it, (..., k).
+
+        ``q``: wanted angles, rad or m, (..., k); ``temperature_c``: of the arm, °C, one or one for
+        each row, None for that of the measurements. As `Compensator.command`.
+        """
         return self.compensator.command(q, temperature_c)
 
     def true(self, q: Any, temperature_c: Any = None) -> FloatArray:
-        """See `Compensator.true`."""
+        """Joint angles at which the nominal robot has its tool where the arm has it, (..., k).
+
+        The inverse of `command`: ``q`` are reported angles, rad or m, (..., k). As
+        `Compensator.true`.
+        """
         return self.compensator.true(q, temperature_c)
 
     def uncertainty(self, q: Any) -> FloatArray:
-        """See `Compensator.uncertainty`."""
+        """Mean square error of the first marker's position in the first sensor, m², (..., 3, 3).
+
+        After correction at wanted angles ``q``, rad or m, (..., k), along axes of R. As
+        `Compensator.uncertainty`.
+        """
         return self.compensator.uncertainty(q)
 
     def trajectory(
         self, times_s: Any, positions: Any, velocities: Any = None, **more: Any
     ) -> CorrectedTrajectory:
-        """See `corrected_trajectory`."""
+        """Trajectory to send for a wanted one of the nominal robot.
+
+        ``times_s``: ascending, (n,), at least two; ``positions, velocities``: wanted, (n, k).
+        Further arguments and errors as of `corrected_trajectory`.
+        """
         return corrected_trajectory(self.compensator, times_s, positions, velocities, **more)
 
 
@@ -330,7 +346,10 @@ def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
 
 
 def _term(term: JointTerm | BaseTerm, chain: SerialChain) -> dict[str, Any]:
-    """Term of the file for a term of the model."""
+    """Term of the file for a term of the model, as plain data.
+
+    Fields that its driver and form do not need are absent.
+    """
     function = term.function
     part: dict[str, Any] = {'effect': term.effect, 'coefficients': term.coefficients}
     part |= {'driver': function.driver, 'form': function.form}
@@ -349,7 +368,7 @@ def _term(term: JointTerm | BaseTerm, chain: SerialChain) -> dict[str, Any]:
 
 
 def _origins(geometry: Geometry, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Origins of the file that are changed."""
+    """Origins of the file that are changed: name of joint or 'tool', shift, m, and turn, rad."""
     rows = zip((*names, 'tool'), geometry.shifts, geometry.turns, strict=True)
     return [
         {'at': name, 'shift': shift, 'turn': turn}

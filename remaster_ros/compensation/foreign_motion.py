@@ -135,7 +135,7 @@ class ArmReports:
         return taken
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether the last report came within `FRESH_S` before a wall time."""
+        """Whether the last report came within `FRESH_S`, 0.25 s, before a wall time, s."""
         return wall_s - self._wall_s <= FRESH_S
 
     @property
@@ -188,7 +188,10 @@ class TrueAngles:
         self._end: tuple[FloatArray, FloatArray] | None = None
 
     def lead(self, passed: SentTrajectory) -> None:
-        """Note the trajectory that is sent: at its end the planner expects its wanted angles."""
+        """Note the trajectory that is sent: at its end the planner expects its wanted angles.
+
+        The branch that was followed is forgotten.
+        """
         self._end, self._is_known = passed.end, False
 
     def at(self, q: FloatArray, temperature_c: float | None, now_s: float) -> FloatArray:

@@ -127,7 +127,10 @@ class CorrectionInUse:
 
     @cached_property
     def _bends(self) -> FloatArray:
-        """Rotation at each joint that `true_arm` lacks, rad, (n, k), in sampled configurations."""
+        """Rotation at each joint that `true_arm` lacks, rad, (n, k).
+
+        In the n sampled configurations.
+        """
         frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
         steps = [_steps(one) for one in (frames, rigid)]
@@ -156,7 +159,10 @@ class CorrectionInUse:
 
     @cached_property
     def shifts(self) -> FloatArray:
-        """Least and largest sum to be added to reported angles, rad, (2, k)."""
+        """Least and largest sum to be added to reported angles, rad or m, (2, k).
+
+        Over the sampled configurations, at the temperature of the measurements.
+        """
         model = self.compensator.model
         drivers = model.drivers(self._sampled, model.warming(len(self._sampled), None))
         added = model.added_angles(drivers)

@@ -74,7 +74,10 @@ class MasteringStep:
 
     @property
     def to_set_zero(self) -> str:
-        """Position to drive to, as the pad shows it (`unit`), if the controller can only set 0."""
+        """Position to drive to, as the pad shows it (`unit`), if the controller can only set 0.
+
+        The position to drive to less that to be set.
+        """
         return self.shown(self.drive_to - self.set_to)
 
 

@@ -176,12 +176,12 @@ class DrawnPath:
         return np.stack([np.interp(times, self.t, q) for q in self.q.T], axis=1)
 
     def speed(self, times: FloatArray) -> FloatArray:
-        """Velocities of a cubic at times, (n, k)."""
+        """Velocities, rad/s, of a cubic at times, s, (n, k); not for lines (AssertionError)."""
         assert self._cubic is not None
         return np.asarray(self._cubic(times, 1))
 
     def rests(self, end: int) -> bool:
-        """Whether a cubic has no velocity at its first (0) or last (-1) point."""
+        """Whether a cubic has no velocity at its first (0) or last (-1) point; False for lines."""
         return self.v is not None and not np.any(self.v[end])
 
     def accelerations(self) -> FloatArray:
@@ -284,7 +284,10 @@ def _allowed(
 
 
 def _knot_indices(times: FloatArray, interval_s: float) -> IntArray:
-    """Indices of times at intervals of at least `interval_s`, with both ends."""
+    """Indices of ascending times at intervals of at least `interval_s`, with both ends.
+
+    The last interval may be shorter. Longer steps of the times stay as they are.
+    """
     chosen = [0]
     last = len(times) - 1
     while chosen[-1] < last:

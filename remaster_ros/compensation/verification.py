@@ -201,7 +201,10 @@ class _ProjectedRows:
         )
 
     def unsure(self, q: FloatArray) -> FloatArray:
-        """Displacements by one standard deviation of each uncertain parameter, m, (3 n, r)."""
+        """Displacements by one standard deviation of each uncertain parameter, m, (3 n, r).
+
+        At commanded angles (n, k); widened as poses that were left out have shown.
+        """
         spread = self.model.widening * (self._derivative(q) @ self.model.root.T)
         return spread.reshape(3 * len(q), -1)
 
@@ -221,7 +224,10 @@ class _ProjectedRows:
 
 
 def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, FloatArray]:
-    """Angles that reach the joints for wanted ones (n, k) in each state, rad or m, (n, k)."""
+    """Angles that reach the joints for wanted ones (n, k) in each state, rad or m, (n, k).
+
+    States: 'in_use' (the command), 'not_in_use' (wanted), 'twice' and 'wrong_sign'.
+    """
     once = compensator.command(wanted)
     return {
         'in_use': once,
@@ -318,7 +324,10 @@ def _single_joint_alternatives(
 
 
 def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
-    """Expected log odds between two states whose prediction differs by a step."""
+    """Expected log odds between two states whose predictions differ by a step, m, (3 n,).
+
+    ``unsure``: as of `_ProjectedRows.unsure`; ``sigma``: noise of a reading per axis, m.
+    """
     covariance = sigma**2 * np.eye(len(step)) + unsure @ unsure.T
     return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
@@ -428,7 +437,11 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
 
 
 def _poses(side: _ProjectedRows, rivals: list[FloatArray]) -> int | None:
-    """Number of poses that would exclude the alternatives; None if `MOST_POSES` would not."""
+    """Number of poses that would exclude the alternatives; None if `MOST_POSES` would not.
+
+    At least half as many again as were measured. ``rivals``: steps between the states, (3 n,)
+    each.
+    """
     unsure = side.projected(side.unsure(side.command))
     residual = side.projected(side.measured - side.at['in_use'])
     sigma = float(SIGMAS[np.argmax(_log_likelihood(residual, unsure))])

@@ -88,7 +88,7 @@ class Inputs:
 
     @property
     def judgement(self) -> Judgement:
-        """Judgement of the fit."""
+        """Judgement of the fit; the fit has to have one (AssertionError)."""
         assert isinstance(self.fit.judgement, Judgement)
         return self.fit.judgement
 
@@ -209,7 +209,10 @@ def all_taken_out(found: Discovered | None) -> bool:
 
 
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """3-D error of each row with the robot model of a URDF (text), mm, (n,)."""
+    """3-D error of each row with the robot model of a URDF (text), mm, (n,).
+
+    As of `errors_with_urdf`: registrations and markers are fitted, offsets are 0.
+    """
     return lengths_mm(errors_with_urdf(session, urdf))
 
 
@@ -351,7 +354,12 @@ class Answer:
 
 
 def answer_of(inputs: Inputs) -> Answer:
-    """Action, gain and remaining errors for a session and its results."""
+    """Action, gain and remaining errors for a session and its results.
+
+    The stages are the errors today, with offsets, and with what further can be used: causes, if
+    all are errors of the measurement that are taken out, or a robot model, if it makes the mean
+    error clearly smaller (`NOTICEABLE_GAIN`). The rows judged are those of `judged_rows`.
+    """
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
     judged, held_out = judged_rows(inputs)

@@ -182,7 +182,10 @@ def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
 
 
 def fit_content(result: FitResult) -> schemas.Fit:
-    """Checked content of fit.json, as an object; keys without a value are unset."""
+    """Checked content of fit.json, as an object; keys without a value are unset.
+
+    Standard deviations of draws have n - 1 in the denominator; those of offsets are widened.
+    """
     draws = result.draws.reshape(-1, result.draws.shape[-1])
     content: dict[str, Any] = {
         'format': schemas.FIT_FORMAT,

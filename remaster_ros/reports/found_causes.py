@@ -109,5 +109,8 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovere
 
 
 def _separable(effect: FoundEffect) -> list[LookAlike]:
-    """Look-alikes of an effect that are neither another name nor a general form of it."""
+    """Look-alikes of an effect that further poses can separate from it.
+
+    Not those that are another name or a general form of it.
+    """
     return [other for other in effect.confusable_with if not other.same and not other.general]

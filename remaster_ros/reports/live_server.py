@@ -130,7 +130,10 @@ class BoundedServer(HTTPServer):
             connection.since_s = time.monotonic()
 
     def _close_oldest(self, address: str) -> None:
-        """Close the oldest connection of an address, those without the token first."""
+        """Close the oldest connection of an address, those without the token first.
+
+        The address has to have one. Age is the time since its last answer or its begin.
+        """
         of_it = [
             (connection.has_token, connection.since_s, id(stream))
             for stream, connection in self._of(address)
@@ -385,7 +388,10 @@ class LiveServer:
         self._view, self._seen, self._plan = content, seen, plan
 
     def show_plan(self, html: bytes) -> str:
-        """Serve the page of a plan in place of the previous one; returns its address."""
+        """Serve the page of a plan in place of the previous one; returns its address.
+
+        ``html``: the page, not compressed. The address, relative, is random for each page.
+        """
         name = secrets.token_urlsafe(32)
         self._loop.call_soon_threadsafe(self._take_plan, name, gzip.compress(html, 6))
         return f'plan/{name}'

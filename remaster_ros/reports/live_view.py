@@ -130,7 +130,10 @@ class LiveView:
             self._pace.update(self._count('configurations_done'), now_s, running=running)
 
     def take(self, body: events.State | events.Event, now_s: float) -> None:
-        """Take a record of /remaster/events: keep a state, make a message of an event."""
+        """Take a record of /remaster/events: keep a state, make a message of an event.
+
+        ``now_s``: present time, s. Reports of unknown sensors are ignored.
+        """
         match body:
             case events.PlannerState():
                 self._planner = body
@@ -237,7 +240,10 @@ class LiveView:
         return (plan, page) if page and _PLAN_NAME.fullmatch(plan) else ('', '')
 
     def view(self, now_s: float) -> dict[str, Any]:
-        """Content of the page at a time, s, of plain types."""
+        """Content of the page at a time, s, of plain types.
+
+        Messages come newest first, with their age in s.
+        """
         return {
             'run': self._run(now_s),
             'halted': _clip(self._bridge.halted) if self._bridge else '',
@@ -351,7 +357,10 @@ class LiveView:
         }
 
     def _result(self) -> dict[str, Any]:
-        """Offsets and facts of the last fit; no joints before there is one."""
+        """Offsets and facts of the last fit; no joints before there is one.
+
+        Keys: 'joints', a row for each, and 'fit'.
+        """
         return {
             'joints': [
                 self._offset_row(joint, name, *self._offsets[name])
@@ -394,7 +403,10 @@ class LiveView:
         }
 
     def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
-        """Label of each command, whether it is enabled now, and a note."""
+        """Label of each command, whether it is enabled now, and a note why not or what it does.
+
+        Commands: 'collect', 'pause', 'stop' (always enabled), 'fit', 'confirm'.
+        """
         state = self._planner.state if self._planner else ''
         silent, confirmation = self._silent(PLANNER, now_s), self._confirmation()
         unconfirmed = self._values.get('confirmed') == 'no'

@@ -52,7 +52,10 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Lengths and tilts estimated from a fit's session; None without an estimate."""
+    """Lengths and tilts estimated from a fit's session, with the errors of its files.
+
+    None without an estimate. The errors are those with the offsets alone and with the robot model.
+    """
     if result.found is None:
         return None
     geometry = geometry_model(result.found)

@@ -183,7 +183,10 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
 
 
 def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
-    """Numbers of dropped poses and configurations by reason, the most frequent first."""
+    """Numbers of dropped poses and configurations by reason, (poses, configurations).
+
+    The most frequent reason, by the larger of the two, first.
+    """
     poses, solutions = plan.tour.dropped, plan.dropped
     counts = {
         name: (poses.get(name, 0), solutions.get(name, 0)) for name in {**poses, **solutions}

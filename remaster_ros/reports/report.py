@@ -217,7 +217,7 @@ def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
 
 
 def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]]:
-    """A row for each marker of a fit.json: position, std, and distance from the nominal one."""
+    """A row for each marker of a fit.json: position, std, distance from the nominal one, mm."""
     rows = []
     for name, marker in fit['markers'].items():
         position = np.array(marker['position_m'])
@@ -367,7 +367,11 @@ class PlanFacts:
 
 
 def plan_facts(inputs: Inputs) -> PlanFacts | None:
-    """Facts of the session's plan for the page; None if it has none."""
+    """Facts of the session's plan for the page; None if it has none.
+
+    Numbers by split, reasons of dropped poses, minutes that it took (None without times), expected
+    and reached standard deviations and their median ratio.
+    """
     plan, session = inputs.plan, inputs.session
     if plan is None:
         return None
@@ -399,7 +403,10 @@ def plan_facts(inputs: Inputs) -> PlanFacts | None:
 
 
 def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
-    """Planned and recorded configurations of a split; ``words``: its name on the page."""
+    """Planned and recorded configurations of a split, and those lost, by reason.
+
+    ``words``: name of the split on the page. Those without an outcome count as not visited.
+    """
     poses = plan.tour.plans[split].poses
     ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
     recorded = sum(ends.pop(result, 0) for result in RECORDED)

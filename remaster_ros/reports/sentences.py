@@ -627,7 +627,7 @@ def size_words(effect: FoundEffect) -> str:
 
 
 def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
-    """Name of a look-alike of a cause, as text; one of its parts is named as such."""
+    """Name of a look-alike of a cause, capitalized; one of its parts is named as such."""
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
@@ -664,7 +664,10 @@ def std_remark(tolerance_m: float) -> str:
 
 
 def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
-    """Effect on the offsets of lengths and tilts off their drawing, as text."""
+    """Clause on what the standard deviations of the offsets contain of links off their drawing.
+
+    ``imitations``: the largest ones, each a link or axis and its effect on a joint.
+    """
     moved = '; '.join(
         f'{"link" if one.cause == "link_length" else "the axis of joint"} {one.of} is '
         f'{one.shown} at {one.joint}'
@@ -687,7 +690,11 @@ def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
 
 
 def load_words(row: Loadable) -> tuple[str, str]:
-    """Name of a loadable result, and its file or why to leave it, as text."""
+    """Name of a loadable result, and its file or why to leave it, as text.
+
+    It is left if it has no file, or held-out poses do not show that it is better than a plainer
+    one.
+    """
     file = f'{row.file}{_MORE.get(row.result, "")}'
     worse = row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better
     if worse and row.result == 'everything' and row.file:
@@ -719,7 +726,10 @@ _MORE = {
 
 
 def fit_lines(fit: Fit) -> list[str]:
-    """Offsets, errors and verdict of a fit, a line each; the fit has to have a judgement."""
+    """Offsets, errors and verdict of a fit, a line each; the fit has to have a judgement.
+
+    Then clocks, geometry and gross errors, if there are any.
+    """
     assert isinstance(fit.judgement, Judgement)
     width = max(len(row.joint) for row in fit.joint_offsets)
     lines = [f'{row.joint:{width}s} {_offset(row)}' for row in fit.joint_offsets]

@@ -39,7 +39,10 @@ class FileMetadata:
     count: int = 0
 
     def add(self, stamp_ns: int) -> None:
-        """Count a message with a stamp, ns since the epoch, as the last one so far."""
+        """Count a message with a stamp, ns since the epoch, as the last one so far.
+
+        The first call sets the start, too; stamps are not compared.
+        """
         if self.first_ns is None:
             self.first_ns = stamp_ns
         self.last_ns = stamp_ns

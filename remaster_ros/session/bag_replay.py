@@ -57,7 +57,10 @@ class _Keeper:
         write()
 
     def reopen(self, *, go_further: bool = False) -> None:
-        """Continue a stopped session; with ``go_further``, a complete one."""
+        """Continue a stopped session; with ``go_further``, a complete one.
+
+        Raises as `SessionJournal.reopen`.
+        """
         self.journal.reopen(go_further=go_further)
 
     def close(self, exit_status: ExitStatus) -> None:

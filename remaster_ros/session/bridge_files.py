@@ -99,7 +99,10 @@ class LastCommand:
 
     @property
     def places(self) -> FloatArray | None:
-        """Ends between which the arm was led, rad or m, (1 or 2, k); None if unknown."""
+        """Ends between which the arm was led, rad or m, (1 or 2, k): this one, then the next.
+
+        None if unknown.
+        """
         ends = [end for end in (self.end, self.next_end) if end is not None]
         return None if self.end is None else np.array(ends)
 

@@ -281,7 +281,10 @@ class PatientFile:
         return len(self._waiting)
 
     def write(self, data: bytes) -> int:
-        """Accept a piece and return its length; it waits in memory if the disk is full."""
+        """Accept a piece and return its length; it waits in memory if the disk is full.
+
+        It never raises DiskError; `flush` and `waiting` tell what is not on the disk.
+        """
         self._waiting += data
         self._given += len(data)
         with contextlib.suppress(DiskError):

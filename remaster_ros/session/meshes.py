@@ -136,7 +136,10 @@ def _vertices(loaded: list[Any], unit: float) -> FloatArray:
 
 
 def _parts(loaded: list[Any], unit: float) -> list[MeshPart]:
-    """Return the surfaces of trimesh parts by colour; ``unit``: length of their unit, m."""
+    """Return the surfaces of trimesh parts by colour; ``unit``: length of their unit, m.
+
+    Parts without triangles, or with vertices that are not finite, are left out.
+    """
     by_color: dict[tuple[float, float, float] | None, list[Any]] = {}
     for part in loaded:
         if len(getattr(part, 'faces', ())) and np.all(np.isfinite(part.vertices)):

@@ -457,7 +457,10 @@ def _whole_lines(data: bytes, most: int) -> int:
 def observations_of(
     m: Measurements, sensors: Sequence[str], markers: Sequence[str]
 ) -> Iterator[Observation]:
-    """Yield the rows of columns as observations, with None for NaN or -1."""
+    """Yield the rows of columns as observations, with None for NaN or -1.
+
+    ``sensors, markers``: names by index.
+    """
 
     def rows(values: FloatArray | None) -> Iterator[FloatArray | None]:
         if values is None:
@@ -490,7 +493,11 @@ def optional_of(m: Measurements) -> list[str]:
 
 
 def stacked(parts: Sequence[Measurements]) -> Measurements:
-    """Return the rows of all parts; fields that only some parts have are unknown in the others."""
+    """Return the rows of all parts, one after the other.
+
+    Fields that only some parts have are unknown (NaN, -1 or False) in the others, fields that none
+    has stay None. At least one part.
+    """
     columns: dict[str, Any] = {}
     for name in vars(parts[0]):
         values = [getattr(part, name) for part in parts]

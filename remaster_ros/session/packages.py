@@ -75,7 +75,11 @@ class Confinement:
         self._folders.append(folder.resolve())
 
     def holds(self, path: Path) -> bool:
-        """Return whether a file may be read: below one of the folders, or named by the user."""
+        """Return whether a file may be read: below one of the folders, or named by the user.
+
+        Links are resolved, except below the folders of sourced workspaces, which may link
+        elsewhere.
+        """
         real, written = path.resolve(), Path(os.path.abspath(path))
         return (
             real in self._named

@@ -282,7 +282,7 @@ class PlanJournal:
         return self._journal
 
     def _refuse_other_settings(self, made: Mapping[str, Any]) -> None:
-        """Raise InputError if the plan was made with other settings."""
+        """Raise InputError for the first setting that differs from ``made``, those of the plan."""
         other = [name for name, value in self._settings.items() if made.get(name) != value]
         if other:
             name = other[0]
@@ -293,7 +293,10 @@ class PlanJournal:
             )
 
     def _follow(self, record: PlanRecord) -> None:
-        """Update the state by a record, of this planner or of one before it."""
+        """Update tour, visit, state and run by a record, of this planner or of one before it.
+
+        Records on a tour are ignored before there is one.
+        """
         tour = self.tour
         match record:
             case TourRecord():
@@ -321,7 +324,10 @@ class PlanJournal:
         self._follow(record)
 
     def write_out(self) -> None:
-        """Write the records that the disk has not taken yet; `trouble` is '' if all are."""
+        """Write the records that the disk has not taken yet; `trouble` is '' if all are.
+
+        It does not raise DiskError: `trouble` is its text.
+        """
         try:
             while self._unwritten and self._journal is not None:
                 self._journal.append(self._unwritten[0])
@@ -348,7 +354,10 @@ class PlanJournal:
             self._note(RoundRecord())
 
     def drop_remaining_fits(self) -> None:
-        """Drop the remaining poses to fit, as the precision goal is reached."""
+        """Drop the remaining poses to fit, as the precision goal is reached.
+
+        Nothing without a tour.
+        """
         if self.tour is not None:
             self._note(EnoughRecord())
 

@@ -160,7 +160,10 @@ def write_session(folder: str | os.PathLike[str], session: Session) -> None:
 
 
 def all_rows(session: Session) -> Measurements:
-    """Return all rows of a session, references included, sorted by observation number."""
+    """Return all rows of a session, references included, sorted by observation number.
+
+    References have ``is_reference``; without any the session's measurements as they are.
+    """
     m, references = session.measurements, session.references
     if references is None:
         return m

@@ -59,7 +59,7 @@ class SessionGuard:
             self.note(name)
 
     def is_in_place(self) -> bool:
-        """Return whether the folder of this name is still the opened one."""
+        """Return whether the folder of this name is still the opened one, by device and inode."""
         found, mine = signature(self._folder), os.fstat(self._descriptor)
         return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
 

@@ -59,7 +59,11 @@ class Outcomes:
         return self.poses.get(pose, ('', {}))[1].get(solution, '')
 
     def decided(self) -> Decided:
-        """Return the outcomes in the form of the message to the planner: last pose and counts."""
+        """Return the outcomes in the form of the message to the planner.
+
+        Last pose with its decided solutions, number of solutions by outcome (references and
+        registrations not counted), and number of references.
+        """
         last = next(reversed(self.poses), None)
         solutions = () if last is None else tuple(self.poses[last][1])
         ends = [
@@ -307,7 +311,10 @@ class SessionJournal:
         ]
 
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
-        """Return a reading's fields for an observation: stamp shifted, on the tool inverted."""
+        """Return a reading's fields for an observation, without the number of dropped frames.
+
+        The stamp is shifted; of a sensor on the tool the pose is inverted.
+        """
         if reading.sensor in self._header.on_tool:
             reading = reading.inverted()
         values = vars(replace(reading, stamp_s=reading.stamp_s + self._shift_s))

@@ -108,7 +108,10 @@ class Parameters(SimulationParameters):
 
 
 def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
-    """Return the rules by which each sensor of the cell is read, in the cell's order."""
+    """Return the rules by which each sensor of the cell is read, in the cell's order.
+
+    Thresholds and waiting times are the parameters', the rest is the cell's.
+    """
     return tuple(
         SensorRules(
             sensor=name,
@@ -126,7 +129,10 @@ def sensor_rules(cell: Workcell, p: Parameters) -> tuple[SensorRules, ...]:
 
 
 def session_header(cell: Workcell, settle_s: float) -> Session:
-    """Return a session of this cell without observations, created now (UTC)."""
+    """Return a session of this cell without observations, created now (UTC).
+
+    Raises InputError if the URDF has no such arm.
+    """
     chain = cell.chain()
     return Session(
         urdf=cell.urdf_text,
@@ -157,7 +163,7 @@ class Keeper(Protocol):
     full: str
 
     def write(self, write: Callable[[], object]) -> None:
-        """Call `write`, now or when the disk has room."""
+        """Call `write`, now or when the disk has room; its result is dropped."""
 
     def reopen(self, *, go_further: bool = False) -> None:
         """Continue a stopped session; with `go_further`, a complete one."""
@@ -548,7 +554,10 @@ class SessionRecorder:
         return self.required.are_among(self.registration.T_R_N)
 
     def end_reading(self) -> None:
-        """Count and write the outcome of the reading under way, once it is decided."""
+        """Count and write the outcome of the reading under way, once it is decided.
+
+        Nothing before that. Waiting times, refused, accepted and dropped frames are counted.
+        """
         ended = self.recording.end(self.registration.T_R_N)
         if ended is None:
             return
@@ -599,7 +608,10 @@ class SessionRecorder:
         self.take_next()
 
     def _register(self, readings: Sequence[PairedReading]) -> None:
-        """Add readings of registration poses; publish completed registrations, log troubles."""
+        """Add readings of registration poses; publish completed registrations, log troubles.
+
+        Troubles are logged as warnings, of the sensors of these readings alone.
+        """
         for name in self.registration.add(readings):
             self._outlet.registered(name, self.registration.T_R_N[name])
             self._outlet.log(logging.INFO, f'{name} is registered; {self.registration.describe()}')

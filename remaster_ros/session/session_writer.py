@@ -280,7 +280,10 @@ class SessionWriter:
         self._write_due()
 
     def _write_due(self) -> None:
-        """Write the files whose columns or keys have changed; DiskError if the disk is full."""
+        """Write the files whose columns or keys have changed; DiskError if the disk is full.
+
+        Those that are not written remain due.
+        """
         while self._due:
             name = self._due[0]
             write_atomically(self.folder / name, self._content(name))
@@ -431,7 +434,7 @@ class SessionWriter:
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _accept(self, keys: Sequence[RowKeys]) -> None:
-        """Update next free numbers, last stamp and rules by rows that are on the disk."""
+        """Update next free numbers, last stamp and rules by rows on the disk, in their order."""
         for key in keys:
             self._rules.accept(key)
             self._line = key.line + 1

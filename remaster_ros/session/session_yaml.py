@@ -235,12 +235,12 @@ def write_header(session: Session, urdf_name: str, exit_status: str) -> str:
 
 
 def with_exit_status(text: str, exit_status: str) -> str:
-    """Return the text of a session.yaml with another exit status."""
+    """Return the text of a session.yaml with another exit status; comments are lost."""
     return dump_yaml({**load_yaml(text), 'exit_status': exit_status})
 
 
 def with_correction(text: str, correction: Correction) -> str:
-    """Return the text of a session.yaml with a correction added."""
+    """Return the text of a session.yaml with a correction added or replaced; comments are lost."""
     return dump_yaml({**load_yaml(text), 'correction': to_plain(correction)})
 
 
@@ -370,7 +370,10 @@ def _unknown_keys(
 
 
 def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of content with unknown keys added at their places; known ones remain."""
+    """Return a copy of content with unknown keys of ``extra`` added at their places.
+
+    Known keys keep their values; mappings are merged at every level.
+    """
     merged = dict(content)
     for key, value in extra.items():
         if key not in merged:

@@ -202,7 +202,10 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
 
 
 def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
-    """Return new, unused names of sensors and markers: NAME_2 for session number 2."""
+    """Return new, unused names of sensors and markers, by their old ones.
+
+    NAME_2 for session number 2, again with _2 while that is taken in the joined session.
+    """
     taken = {*joined.sensors, *joined.markers}
     names = {}
     for name in dict.fromkeys((*session.sensors, *session.markers)):

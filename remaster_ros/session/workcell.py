@@ -116,7 +116,10 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
 
     @property
     def known_kind(self) -> SensorKind | None:
-        """Kind of the instrument, also by the driver that publishes its topic; None if unknown."""
+        """Kind of the instrument: as stated, else by the driver that publishes its topic.
+
+        Else 'camera' for a sensor on the tool; None if unknown.
+        """
         by_topic = KIND_OF_TOPIC.get(self.topic.lstrip('/').partition('/')[0])
         return self.kind or by_topic or ('camera' if self.mounted_on else None)
 
@@ -141,7 +144,10 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
         return f'{self.topic}/pose' if self.message_type == POSE else ''
 
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
-        """First validation error of this sensor, prefixed by its YAML path; '' if valid."""
+        """First validation error of this sensor, prefixed by its YAML path; '' if valid.
+
+        ``where``: that path; ``markers``: those of the cell, name -> position.
+        """
         if problem := self._marker_problem(where, markers):
             return problem
         if self.source and not self.message_type:
@@ -211,7 +217,10 @@ class CellBox(msgspec.Struct, forbid_unknown_fields=True):
     yaw_deg: float = 0.0
 
     def body(self, name: str) -> Body:
-        """Return the body for collision checks, in base_link; InputError for an invalid size."""
+        """Return the body for collision checks, in base_link; InputError for an invalid size.
+
+        ``name``: in messages on collisions.
+        """
         rotation = matrix_from_rpy(np.array([0.0, 0.0, radians(self.yaw_deg)]))
         return obstacle(name, self.center_m, self.size_m, rotation)
 
@@ -320,7 +329,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return index (from 0) and values (rad or m) of the held joint; None if there is none."""
+        """Return index (from 0) and values (rad or m) of the held joint, as a dict of one.
+
+        None if there is none. Raises ValueError if the chain has no such joint.
+        """
         if not self.held_joint:
             return None
         index = chain.joint_names.index(self.held_joint)

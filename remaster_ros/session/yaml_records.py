@@ -107,7 +107,10 @@ def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: K
 
 
 def _fields(record: type[msgspec.Struct], steps: list[str]) -> list[str]:
-    """Return the keys of a nested record at some steps into a record; [] if that is no record."""
+    """Return the keys of a nested record at some steps (keys) into a record type.
+
+    [] if there is no record.
+    """
     kind: Any = msgspec.inspect.type_info(record)
     for step in steps:
         kind = _record_of(kind)
