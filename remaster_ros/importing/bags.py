@@ -55,7 +55,7 @@ SUFFIXES = ('.mcap', '.db3', '.bag')
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a bag, by its name alone: a file, or a folder that holds one.
+    """Whether a path is a bag: a file, by its ending alone, or a folder that holds one.
 
     Files end in .mcap, .db3 or .bag; a folder may have a metadata.yaml instead.
     """

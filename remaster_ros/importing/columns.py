@@ -567,7 +567,10 @@ def _find_orientation(headers: Sequence[_Header], taken: set[int], found: Column
 def _has_words_of_point(
     headers: Sequence[_Header], found: Columns, columns: Sequence[int]
 ) -> bool:
-    """Whether the header of an orientation has the same words as the header of the point."""
+    """Whether the header of an orientation has the same words as the header of the point.
+
+    Words for axes, positions and turns are not compared; `columns`: those of the orientation.
+    """
     stems = [
         tuple(word for word in _with_axis(headers[i].words) if word not in (*AXES, *_PLACES))
         for i in found.point[:1]

@@ -19,7 +19,10 @@ _INDEX = 'index'
 
 
 def is_frame(given: Any) -> bool:
-    """Whether an object is a data frame with the interface of pandas."""
+    """Whether an object is a data frame with the interface of pandas.
+
+    It has ``columns``, ``index`` and ``itertuples``.
+    """
     return all(hasattr(given, name) for name in ('columns', 'index', 'itertuples'))
 
 

@@ -161,7 +161,10 @@ class _Frames:
 
 
 def _less_mean(values: FloatArray, run: IntArray) -> FloatArray:
-    """Values (n,) less the mean of their run, (n,)."""
+    """Values (n,) less the mean of their run, (n,).
+
+    ``run``: index of each value's run, from 0 without gaps, (n,).
+    """
     means = np.bincount(run, values) / np.bincount(run)
     result: FloatArray = values - means[run]
     return result

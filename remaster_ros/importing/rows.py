@@ -319,7 +319,7 @@ def _pairs_by_time(points: Table, joints: Table, within_s: float) -> Pairs | Non
 
 
 def _span(times_s: FloatArray) -> str:
-    """First and last time as text: dates, or seconds if the times have no date."""
+    """First and last time as text: local dates, or seconds if the times have no date."""
     ends = times_s.min(), times_s.max()
     if ends[0] < WITHOUT_DATE_S:
         return f'{ends[0]:.1f} to {ends[1]:.1f} s'
@@ -893,7 +893,10 @@ def _column_meanings(
 def _choice_for_table(
     chosen: ColumnChoice, table: TextTable, tables: Sequence[TextTable]
 ) -> ColumnChoice:
-    """Chosen columns that concern one table: numbers count only for a table without names."""
+    """Chosen columns that concern one table: numbers count only for a table without names.
+
+    If all `tables` have names, numbers count for all. See `_choice_for_file`.
+    """
     of_table = _choice_for_file(chosen, table.path, [one.path for one in tables])
     if not table.has_header or all(one.has_header for one in tables):
         return of_table

@@ -353,7 +353,10 @@ def _nothing_found(given: Fitted, error_text: str, chain: SerialChain, oriented:
 
 
 def columns_of(rows: RawRows, chain: SerialChain) -> Columns:
-    """Names of the columns of joints and points, and their units, for sentences on mistakes."""
+    """Names of the columns of joints and points, and their units, for sentences on mistakes.
+
+    Points are those of the first marker, or X, Y and Z.
+    """
     joints = tuple(split_unit(column)[0] for column in rows.joint_columns)
     return Columns(
         joints=joints,

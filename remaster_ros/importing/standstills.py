@@ -57,7 +57,10 @@ _ALIKE = 0.9
 
 
 def refuse_sliding(chain: SerialChain, path: Path) -> None:
-    """Raise InputError for an arm with a prismatic joint: standstills are judged by angles."""
+    """Raise InputError for an arm with a prismatic joint: standstills are judged by angles.
+
+    `path`: of the stream, for the message.
+    """
     for joint in np.flatnonzero(chain.slides)[:1]:
         raise InputError(
             f"{path}: it is a stream, and joint '{chain.joint_names[joint]}' slides; standstills "

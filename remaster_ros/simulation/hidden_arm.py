@@ -87,7 +87,7 @@ class TrueArm:
         return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
 
     def _deviation(self) -> Deviation:
-        """Deviation at the last stop, with the history of all stops."""
+        """Deviation at the last stop, one row, with the history of all kept stops."""
         times = np.array(self._times)
         visited = Round(
             q=np.array(self._stops),

@@ -720,7 +720,10 @@ def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_unnamed('marker', 'time', at_some_time(_draw_marker_slip))
 def slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Shift of one marker on the tool from a moment on, m along its x, y, z."""
+    """Shift of one marker on the tool from a moment on, m along its x, y, z.
+
+    Added to ``d.marker``; the detail has ``marker`` and ``moment_s``.
+    """
     d.marker[:, d.markers.index(e.detail['marker'])] += _after(e, c)[:, None] * e.values
 
 

@@ -231,7 +231,11 @@ class Beam:
         return self.locked
 
     def _shaken(self, t: float, moving: bool) -> bool:
-        """Whether a large move breaks the beam now; a random decision, once for each move."""
+        """Whether a large move breaks the beam now; a random decision, once for each move.
+
+        A move is large once its fastest joint has swept ``large_move_rad``. `t`: end of the step,
+        s; ``moving``: whether the arm moves then.
+        """
         if not moving:
             self._swept_rad, self._move_judged = 0.0, False
             return False
@@ -776,7 +780,10 @@ class FakeLaserTracker:
         self._send(self._instrument.greeting())
 
     def _receive(self) -> None:
-        """Answer the client's received commands; drop the client if its stream is broken."""
+        """Answer the client's received commands; drop the client if its stream is broken.
+
+        A packet that cannot be read, or is no command, is answered by an error report.
+        """
         assert self._client is not None
         try:
             self._reader.receive_data(self._client.recv(4096))

@@ -410,7 +410,7 @@ class FakeOptiTrackServer:
 
     @property
     def command_port(self) -> int:
-        """Port that answers CONNECT, once started."""
+        """Port that answers CONNECT, once started (AssertionError before)."""
         assert self._command is not None, 'not started'
         return self._command.getsockname()[1]
 

@@ -166,7 +166,10 @@ class FakeArm:
         return 2 if 'doubled' in self.world.faults('robot') else 1
 
     def _wrap(self, faults: Numbers) -> FloatArray:
-        """Error of the positions by a joint that is a turn off, rad, (k,)."""
+        """Error of the positions by a joint that is a turn off, rad, (k,), 0 without such a fault.
+
+        Of ``wrapped_once`` only in the first call while the fault is set.
+        """
         turn = np.zeros(len(self.names))
         if 'wrapped' in faults:
             turn[int(faults['wrapped']) - 1] = 2 * np.pi

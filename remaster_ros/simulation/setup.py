@@ -163,7 +163,10 @@ def make_world(
 
 
 def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
-    """First positions of a fake arm, (k,): these angles, and the middle of a slide's range."""
+    """First positions of a fake arm, rad or m, (k,), by the angles of its first joints.
+
+    Further joints are at 0, those that slide in the middle of their range.
+    """
     q = np.zeros(len(chain))
     known = min(len(chain), len(angles))
     q[:known] = angles[:known]

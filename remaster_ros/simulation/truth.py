@@ -134,7 +134,10 @@ def mount_body(rng: np.random.Generator) -> FloatArray:
 
 
 def truth_to_dict(truth: SessionTruth, chain: SerialChain, seed: int) -> dict[str, Any]:
-    """Content of truth.json (``remaster-truth/1``), in the units of fit.json."""
+    """Content of truth.json (``remaster-truth/1``), plain data in the units of fit.json.
+
+    Offsets in degrees, or mm for a joint that slides; lengths in m; sizes of effects in mm.
+    """
     sensors = truth.sensors
     bodies = {
         name: {'rotation_xyzw': quaternion_xyzw(R_T_B).tolist()}

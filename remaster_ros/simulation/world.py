@@ -155,11 +155,11 @@ class World:
 
     @property
     def has_moved(self) -> bool:
-        """Whether the arm was ever commanded."""
+        """Whether the arm was ever commanded, by any process."""
         return (self.folder / MOTION_FILE).stat().st_size > 0
 
     def _read_motions(self) -> None:
-        """Read the trajectories added to the file since the last call."""
+        """Read the trajectories added to the file since the last call; half a line waits."""
         if self._lines is None:
             self._lines = (self.folder / MOTION_FILE).open()
             self._lines.seek(self._position)

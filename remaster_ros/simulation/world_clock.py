@@ -104,7 +104,11 @@ class Pace:
                 self._leads.add(pid)
 
     def go_on(self, most_s: float = math.inf) -> None:
-        """Raise the limit of world time as far as the participants allow, up to `most_s`."""
+        """Raise the limit of world time as far as the participants allow, up to `most_s`.
+
+        Up to `AHEAD_S`, and `AHEAD_WALL_S` of wall time, beyond the slowest participant, and
+        `LEAD_AHEAD_S` beyond the first report that a process leading the arm has not received.
+        """
         wall, now = time.monotonic(), self._clock.now()
         for pid, done_s in self._clock.slots().values():
             known = self._fakes.get(pid)

@@ -81,7 +81,7 @@ class Round:
 
     @cached_property
     def previous_q(self) -> FloatArray:
-        """Configuration before each visit, rad, (m, k)."""
+        """Configuration before each visit, rad or m, (m, k): home before the first."""
         return np.concatenate((self.home[None], self.q[:-1]))
 
 
