@@ -373,7 +373,10 @@ class Model:
         return derivative
 
     def natural_jacobian(self, x: FloatArray, rows: Rows) -> FloatArray:
-        """Derivative of `predict` by the natural parameters x (size,), (n, 3, size)."""
+        """Derivative of `predict` by the natural parameters x (size,), (n, 3, size), in SI units.
+
+        Natural ones are those before `pinned`: joints 1 and k have columns of their own.
+        """
         return self._derivative(self.offsets(x), x, rows)
 
     def inner_pose(self, z: FloatArray, rows: Rows) -> Pose:

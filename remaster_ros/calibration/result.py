@@ -130,7 +130,11 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
 
 
 def _unit(columns: FloatArray) -> FloatArray:
-    """Columns (n, 3, c) without those of zeros, as (3 n, c), with a mean square of 1 per row."""
+    """Columns (n, 3, c) without those of zeros, as (3 n, c), each scaled by itself.
+
+    The mean over the n rows of a column's squared length (3,) becomes 1. Zeros: below 1e-9 of the
+    longest column.
+    """
     flat = columns.reshape(-1, columns.shape[2])
     length = np.linalg.norm(flat, axis=0)
     kept = length > 1e-9 * np.max(length)

@@ -72,7 +72,7 @@ class _Log(Outlet):
     """Logs warnings and errors of the session recorder."""
 
     def log(self, level: int, text: str) -> None:
-        """Log a line of level warning or above; others are dropped."""
+        """Log a line of level warning or above, as in `logging`; others are dropped."""
         if level >= logging.WARNING:
             log.log(level, text)
 

@@ -314,7 +314,8 @@ class PlanJournal:
     def _note(self, record: PlanRecord) -> None:
         """Write a record, or keep it until the disk has room, and update the state by it.
 
-        The first one makes folder and file.
+        The first one makes folder and file: DiskError if that fails, InputError as `_open`. Later
+        a full disk shows in `trouble` alone.
         """
         if self._journal is None:
             make_folder(self.path.parent)
@@ -362,7 +363,10 @@ class PlanJournal:
             self._note(EnoughRecord())
 
     def open_visit(self, visit: PoseVisit) -> None:
-        """Begin a visit that the tour proposes, before the arm is sent there."""
+        """Begin a visit that the tour proposes, before the arm is sent there.
+
+        It takes the place of one that is open.
+        """
         self._note(VisitRecord(visit.split, visit.index, visit.ids, visit.unreached))
 
     def record_state(self, state: str, run: str = '') -> None:
