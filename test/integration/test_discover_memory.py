@@ -72,7 +72,7 @@ def peak_mb(rows: int, folder: Path) -> float:
     )
     assert process.returncode == 0, process.stderr
     found = read_discovery(folder / 'out' / 'discovery.json')
-    assert ('joint_error_curve', [2]) in [(e.name, e.joints) for e in found.effects]
+    assert ('joint_error_curve', (2,)) in [(e.name, tuple(e.joints)) for e in found.effects]
     assert found.rows_searched.searched <= 1100
     return float(process.stdout) / 1024
 
