@@ -396,6 +396,9 @@ class Walk:
         better = self._pair_for_pair()
         if better is not None:
             self.chains.append(self._chain(better, hot=False))
+        better = self._form_for_shapes()
+        if better is not None:
+            self.chains.append(self._chain(better, hot=False))
         changed = self._with_changes(changes) if start is None else []
         if self._refined() or changed:
             first = max([self._best_found, *changed], key=lambda one: one.value)
@@ -410,6 +413,30 @@ class Walk:
     def _best_found(self) -> Evaluated:
         """Best model of all chains so far."""
         return max((chain.best for chain in self.chains), key=lambda one: one.value)
+
+    def _form_for_shapes(self) -> Evaluated | None:
+        """Return a model better than all so far, with a free form in place of its shapes.
+
+        Shapes are blocks of thousands (`Effect.many`) at the form's place and driver, as waves are
+        of a joint's error curve: a chain leaves several of them at once in no move. None if no
+        exchange is better.
+        """
+        start = best = self._best_found
+        for form in self.by_form:
+            member = form.members[0]
+            shapes = {
+                block
+                for block, _ in start.model
+                if EFFECTS[self.pool.blocks[block].candidate.name].many
+                and self.pool.blocks[block].candidate.is_shape_of(member)
+            }
+            if not shapes or form in start.families:
+                continue
+            model = tuple(one for one in start.model if one[0] not in shapes)
+            found = evaluated(self.pool, [*start.families, form], model, start)
+            if found is not None and found.value > best.value:
+                best = found
+        return None if best is start else best
 
     def _pair_for_pair(self) -> Evaluated | None:
         """Return a model better than all so far, with two weak blocks of a best one exchanged.
