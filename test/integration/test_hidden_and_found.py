@@ -58,3 +58,23 @@ def test_where_noise_alone_is_hidden_nothing_is_named(noise):
     """Of 300 empty sessions two had a cause."""
     _, found = found_in(Recipe(4200 + NOISES.index(noise), (), noise=noise, sensors=('mocap',)))
     assert not found.effects
+
+
+@pytest.mark.qualify
+@pytest.mark.parametrize(
+    'recipe',
+    [
+        Recipe(
+            806644669, ('base_compliance', 'joint_error_curve', 'thermal_growth'), 5.7,
+            robot='iiwa7', noise='range', outliers=True,
+        ),
+        Recipe(
+            3734294646, ('base_compliance', 'encoder_scale', 'sensor_distortion'), 4.74,
+            robot='iiwa7', sensors=('mocap',), noise='pose_common', outliers=True,
+        ),
+    ],
+    ids=['waves that are a curve', 'two that stand for two'],
+)  # fmt: skip
+def test_what_no_single_move_of_a_chain_leaves_is_left(recipe):
+    hidden, found = found_in(recipe)
+    assert judge(hidden.world, hidden.truth, found).named_right
