@@ -100,7 +100,11 @@ def accuracy_of(
     rng: np.random.Generator,
     modelled: ToolOrientations | None = None,
 ) -> dict[str, Any]:
-    """The three metrics before and after, as fit.json has them.
+    """The metrics before and after, as fit.json has them.
+
+    By split ('optimization', 'validation'), None for one without rows: relative, position,
+    theoretical and the paper's theoretical error, the latter two also over the whole workspace. A
+    metric that is not available has None for its numbers and the reason as ``why``.
 
     Parameters
     ----------
@@ -112,8 +116,8 @@ def accuracy_of(
     predicted_before, predicted_after
         Modelled markers in the sensors' frames with offsets at zero and as estimated, m, (n, 3).
     predictive
-        For the theoretical metric: the posterior, and the pinned parameters of the fit with
-        offsets at zero; None without a posterior.
+        For the theoretical metrics: the posterior, and the pinned parameters of the fit with
+        offsets at zero; without it these are not available.
     rng
         For the theoretical metric.
     modelled

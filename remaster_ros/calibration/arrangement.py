@@ -474,11 +474,11 @@ def closest(found: Sequence[Fitted]) -> list[Fitted]:
 def within_limits(
     arrangement: Arrangement, chain: SerialChain, columns: FloatArray
 ) -> Arrangement | None:
-    """Arrangement with a whole turn added to joints, so that all angles keep the joints' limits.
+    """Arrangement with a whole turn added to joints with quarter turns, so that limits are kept.
 
-    None if some joint's angles do not keep them by one turn, nor row by row by up to two turns
-    (`SerialChain.within_turns`). ``columns``: of the table, (n, k); 1 degree beyond a limit is
-    kept.
+    A joint whose angles keep them only row by row, by up to two turns
+    (`SerialChain.within_turns`), is left as it is; None if one does not even then. ``columns``: of
+    the table, (n, k); 1 degree beyond a limit is kept.
     """
     q = arrangement.joints(columns)
     low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD

@@ -125,10 +125,11 @@ def find_gauge(
 def known_offsets(
     chain: SerialChain, why: tuple[str, ...], by_data: FloatArray, std: FloatArray
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Mask of the identifiable offsets, (k,), and the reasons for the others.
+    """Mask of the identifiable offsets, (k,), and reasons: ``why``, and one for each left out.
 
-    Identifiable are those that the data determine, or a prior nearly as well; none with a total
-    std above a degree. ``chain``: the k joints; ``why``: reason for each joint that the data do
+    Identifiable are those that the data determine, or a prior within `AS_GOOD_AS_SEEN` times as
+    well (their reason stays); none with a total std above a degree, and none at all if the data
+    determine none. ``chain``: the k joints; ``why``: reason for each joint that the data do
     not determine, '' for the others; ``by_data, std``: standard deviation by the model, and with
     known unmodelled errors, rad or m, (k,).
     """

@@ -303,8 +303,9 @@ def _linear_markers(
 def _refined(
     model: Model, rows: Rows, priors: Sequence[Prior], z: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its log spread.
+    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its cost.
 
+    The cost is the sum over the rows of the log of their sensor's robust spread.
     The outer joints stay at 0, as in pinned coordinates the data do not depend on them. The
     extension stays at its point of linearisation.
     """

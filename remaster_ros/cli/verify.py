@@ -140,10 +140,10 @@ def _on(session: Session, folder: Path) -> BoolArray:
 
 
 def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
-    """Return the desired joint angles, rad, (n, k).
+    """Return the desired joint angles, rad, (n, k): the columns ``wanted`` of the session.
 
-    Raises InputError if a row has none; ``on``: rows with the correction on, (n,), whose reported
-    angles are the desired ones if the correction is inside the controller.
+    Where these are empty, the reported angles of rows with the correction ``on``, (n,), if it is
+    inside the controller. Raises InputError, with the ``folder``, if a row has neither.
     """
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()

@@ -154,7 +154,10 @@ class TourProgress:
         return result[0] if result else None
 
     def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
-        """Begin the next visit and return it; None while it is planned, and at the end.
+        """Begin the next visit and return it; None while there is none to begin.
+
+        None while it is planned, while the arm cannot go on (`standing` has the reason), once when
+        the poses left to fit are dropped as enough is known, and at the end (`is_complete`).
 
         ``q``: configuration of the arm, rad, (k,); ``sensors``: must be registered before the
         collection; ``words``: state of the registration, for the message.

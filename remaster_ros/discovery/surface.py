@@ -210,7 +210,7 @@ class Pool:
             self.excluded[index] = np.array(sorted(set().union(*(users[name] for name in names))))
 
     def prior(self, model: Model) -> float:
-        """Return the log prior odds of a model."""
+        """Return the log prior odds of a model: its blocks', and `KIND_ODDS` for each kind."""
         which = [block for block, _ in model]
         present = len(np.unique(self.kind[which]))
         return float(np.sum(self.log_prior[which]) + present * np.log(KIND_ODDS))

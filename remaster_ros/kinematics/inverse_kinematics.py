@@ -322,7 +322,11 @@ class InverseKinematics:
     def _starts(
         self, values: tuple[float, ...], exact: _ExactArm | None, T: FloatArray
     ) -> FloatArray:
-        """Return starts of Newton's method for a pose and one set of held values, (m, k)."""
+        """Return starts of Newton's method for a pose and one set of held values, (m, k).
+
+        The solutions of the nearest arm with a closed form, ``exact``, or `STARTS` positions
+        spread evenly over the free joints.
+        """
         free = spread(self.chain, self._free, STARTS) if exact is None else exact.starts(T)
         return self._with_held(free, values)
 

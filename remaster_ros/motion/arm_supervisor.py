@@ -240,9 +240,10 @@ class ArmSupervisor:
     def doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Process a report that is not believed or not readable; if that lasts, halt a collection.
 
-        It lasts if for more than `DOUBT_S` none was believed. ``jumped`` says that the arm was
-        reported at a place that it cannot have reached: that halts even without a collection.
-        Else, unless paused, what is usual in the reports is learned anew. ``why``: for people;
+        It lasts if for more than `DOUBT_S` none was believed; until then the actions are those of
+        `tick`. ``jumped``: the arm was reported at a place that it cannot have reached; if that
+        lasts, an idle arm is halted, too. If it lasts and there is nothing to halt, then unless
+        paused what is usual in the reports is learned anew. ``why``: for people;
         ``wall_s``: when the report came, s.
         """
         if self._doubted_wall is None:

@@ -146,8 +146,8 @@ class Interlocks:
     def stopped_on_its_way(self, wall_s: float) -> None:
         """Process that the arm stops by itself, without a reason known to this program.
 
-        As after any interruption: where nothing shows who stops the arm meanwhile, a person goes
-        on. ``wall_s``: now, s.
+        The consent, if it is given, is held from ``wall_s`` on, now, s; `look_at_interruption`
+        decides whether a person has to go on.
         """
         if self.consent is Consent.GIVEN:
             self._held_since_wall, self._released = wall_s, self._is_released

@@ -223,8 +223,9 @@ class MotionUnderWay:
     def near(self) -> float:
         """Largest distance of an arm at rest from the end of a command, rad.
 
-        What counts as still, and what the reports were off where it has stood: their noise, and
-        what the servo leaves. Never more than the distance at which it counts as arrived.
+        What counts as still, and twice (`OTHER_PLACES`) the most that the reports were off where
+        it has stood: their noise, and what the servo leaves. At most the distance at which it
+        counts as arrived, and that before it has stood anywhere.
         """
         settle = self.rules.settle
         if not np.isfinite(self._stood_off):

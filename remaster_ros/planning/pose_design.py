@@ -273,7 +273,8 @@ class _Search:
     def _times(self, chosen: Sequence[int]) -> FloatArray:
         """Return each unit's addition to the robot time of the chosen units, s, (n,).
 
-        From the nearest chosen unit, and for measuring; without chosen ones for measuring alone.
+        From the nearest other chosen unit, infinite without another one, and for measuring;
+        without chosen ones for measuring alone.
         """
         if not chosen:
             return self._units.stay_s
@@ -315,9 +316,9 @@ class _Search:
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
         """Whether each unit brings the design nearer to the floors, (n,).
 
-        A new pose while there are fewer than `poses` of the floors; while fewer than `repeated`
-        have several solutions chosen, one more solution of a pose with a single one, or, with
-        whole poses, only a new pose with several.
+        Every new pose while there are fewer than `poses` of the floors, and also, while fewer than
+        `repeated` have several solutions chosen, one more solution of a pose with a single one.
+        With whole poses, as long as `repeated` is lacking, only new poses with several.
         """
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)

@@ -199,7 +199,7 @@ def _model(
 
 
 def all_taken_out(found: Discovered | None) -> bool:
-    """Whether there are causes, and all are certain errors of the measurement."""
+    """Whether there are causes, not 'undetermined', all certain errors of the measurement."""
     return (
         found is not None
         and found.verdict != 'undetermined'
@@ -443,7 +443,8 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
 def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
     """Title, and errors of all rows, mm, (n,), at each stage: today, zero-offsets, then the rest.
 
-    The rest is the robot model and all causes, as far as there are any.
+    The rest is the robot model and all causes, as far as there are any; the causes alone if all
+    are errors of the measurement.
     """
     rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
     if inputs.causes_mm is not None and all_taken_out(inputs.found):

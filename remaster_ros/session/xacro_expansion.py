@@ -208,7 +208,11 @@ class Expansion:
             yield self._file(found)
 
     def _parsed(self, given: Any, filename: str = '') -> Any:
-        """Return the parsed XML of a text or file; raise InputError if it declares entities."""
+        """Return the parsed XML of the file ``filename``; ``given`` is not used.
+
+        Raises InputError if it declares entities or cannot be read, XacroException if there is no
+        such file.
+        """
         path = Path(filename)
         if not path.exists():
             # xacro's error, since it handles optional files.

@@ -75,7 +75,7 @@ def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
 
 
 def describe(cause: Cause) -> str:
-    """Cause in a few words, such as ``backlash joint 4``."""
+    """Cause in a few words: name, joints if any, sensor or place and driver if any."""
     name, joints, detail = cause
     where = f'joint {", ".join(map(str, joints))}' if joints else ''
     return ' '.join(part for part in (name, where, detail) if part)

@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = -s_j (q_j - from_q_j)."""
+    """One candidate per joint that moved: δq_j = -s_j (q_j - from_q_j), 0 if unknown."""
     return EFFECT.at_joints(
         context,
         context.moving,

@@ -53,10 +53,11 @@ class _Decoder(json.JSONDecoder):
         self.scan_once = json.scanner.py_make_scanner(self)  # type: ignore[attr-defined]
 
     def whole(self) -> Any:
-        """The value of the text, or a list of several values in sequence.
+        """The value of the text, or a list of several values if the first is an object.
 
-        None if it consists of lists in lines. Raises InputError, with the line, for text that is
-        not JSON.
+        None for several others (a list in each line), or if a first value that begins with [[ is
+        not JSON (a printed matrix). Raises InputError, with the line, for other text that is not
+        JSON.
         """
         values = records.Items()
         at = 0

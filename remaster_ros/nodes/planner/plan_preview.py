@@ -73,7 +73,8 @@ class PlanPreview(PlanConfirmation):
         """Draw the next plan if the page shows another one; return a message for the user.
 
         '' while it is drawn, if nothing has changed, if no confirmation is required, and if it
-        cannot be planned, when `trouble` says why. ``q``: the arm's configuration, rad or m, (k,);
+        cannot be told which plan is next, when `trouble` says why. If planning or drawing it
+        fails, the message says so, once. ``q``: the arm's configuration, rad or m, (k,);
         ``peers``: tell which sensors must be registered before the collection.
         """
         if not self.required:
