@@ -91,7 +91,7 @@ def played():
 
 @pytest.fixture(scope='module')
 def browser(tmp_path_factory):
-    browser = Browser(tmp_path_factory.mktemp('profile'))
+    browser = Browser(tmp_path_factory.mktemp('profile'), webgl=False)
     yield browser
     browser.close()
 

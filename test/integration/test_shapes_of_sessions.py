@@ -23,6 +23,9 @@ ALIKE = (
     'each read three times, none held out',
     'some read twice',
     'read twice, a pose for every reading',
+    # As another one that is read twice, or that has few rows held out.
+    'a real arm, each read twice',
+    'one pose of twenty held out',
 )
 
 

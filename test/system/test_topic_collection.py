@@ -7,6 +7,7 @@ from rigs.topic_rig import Collection
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
 
+@pytest.mark.qualify
 def test_sensors_of_other_packages_lose_nothing_to_faults_and_kills(start, client, tmp_path):
     """test/qualification/test_topic_sensors.py has further faults."""
     c = Collection(start, client, tmp_path, candidates=4)

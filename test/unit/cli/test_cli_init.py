@@ -348,6 +348,7 @@ def test_a_scara_is_prepared_and_planned(do, tmp_path):
     assert {name for name, std in plan['expected_std_deg'].items() if std} == {'j2'}
 
 
+@pytest.mark.qualify
 def test_a_rail_is_planned_with_the_arm_where_the_base_link_says_so(do, tmp_path, monkeypatch):
     # To look for the ways of this one takes minutes, and is for another test.
     monkeypatch.setattr(init, 'count_with_free_path', lambda *_: (10, 10))
