@@ -1,7 +1,7 @@
 # Everything from a fresh clone on a Linux machine with Python 3.11+ and pip:
 #   make demo     the main job on fake hardware; ends by saying where the report is
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
-#   make test     the tests, some nine minutes on two idle cores (PYTEST='-k name' is handed on;
+#   make test     the tests, some eleven minutes on two idle cores (PYTEST='-k name' is handed on;
 #                 PYTEST=test/unit/motion runs one folder, docs/first-change.md)
 #   make qualify  all of them, and the campaigns that it leaves out; an hour and a half on two cores
 #   make check    lint, types, layers; CI runs this and make test
