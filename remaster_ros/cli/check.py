@@ -233,7 +233,7 @@ def content_of(
     smallest_mm: float,
     iso: IsoFigures,
 ) -> dict[str, Any]:
-    """Return what was found, as it is printed as JSON; null if a number is not known.
+    """Return the verdict and its figures as printed by --json; null for an unknown number.
 
     ``names``: of the sessions, oldest first; ``iso``: figures of the newest. Lengths are in mm,
     angles in degrees, as the keys say; checks count from 1. ``smallest_mm``: change at the tool
@@ -379,7 +379,7 @@ def in_words(
     names: list[str],
     smallest_mm: float = 1e3 * SMALLEST_M,
 ) -> str:
-    """Return what was found and what to do, in sentences, by the verdict.
+    """Return sentences on the verdict and on the next step.
 
     ``names``: of the checks, oldest first; ``smallest_mm``: change at the tool that matters.
     ``joint_names``: in the chain's order.

@@ -364,7 +364,7 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
 
 
 def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
-    """Return how joint solutions are found, for --json; None without a closed form near."""
+    """Return the method of the inverse kinematics for --json; None without a closed form near."""
     off = kinematics.difference
     return {
         'way': kinematics.method,

@@ -229,13 +229,13 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     )
 
 
-def share_of_gain(before: float, frozen: float, own: float) -> float | None:
+def share_of_gain(before: float, frozen: float, refitted: float) -> float | None:
     """Return the gain by frozen causes in mean square, as a share of the possible gain.
 
     Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
     most 1: what frozen causes gain could be gained. None if that is next to nothing.
     """
-    could = before**2 - min(own, frozen) ** 2
+    could = before**2 - min(refitted, frozen) ** 2
     if could < LEAST_GAIN * before**2:
         return None
     return (before**2 - frozen**2) / could

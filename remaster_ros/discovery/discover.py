@@ -414,9 +414,9 @@ def _judged(
     return residuals.only(kept)
 
 
-def _residuals_as_given(left: FloatArray, kept: BoolArray) -> FloatArray:
+def _residuals_as_given(residuals: FloatArray, kept: BoolArray) -> FloatArray:
     """Return residuals of a model that is not fitted again, whichever rows are kept."""
-    return left
+    return residuals
 
 
 def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:

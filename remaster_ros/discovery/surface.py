@@ -52,7 +52,8 @@ FAR = 12.0
 ROUNDING = 1e-9
 # Rows of columns that are worked on at once, so that they are in the processor's cache.
 ROWS = 64
-# Blocks whose products with all columns are computed with those of another.
+# Blocks whose products with all columns are computed with those of another: these are limited by
+# reading all columns from memory, which is then done once for sixteen.
 AHEAD = 15
 # A column with a smaller RMS displacement per unit displaces nothing, m.
 NOTHING = 1e-12

@@ -19,7 +19,12 @@ from remaster_ros.discovery.solution import Solution
 from remaster_ros.types import FloatArray, IntArray, Measurements
 
 MOST_ROWS = 2_000
-"""Sessions of fewer are searched whole."""
+"""Rows from which on a session is searched in part.
+
+Time and memory grow with the rows that are searched: with 3,000 those of 20,000 rows take 1.3 GiB
+in place of 0.9 (benchmarks/bench_large_session.py). The least effect that shows in a session of
+3,000 rows is larger by a fifth, as the square root of the rows.
+"""
 FEWEST_TO_SEARCH = 12
 """Poses from which on a search for causes is worth its while."""
 FEWEST_POSES = 500

@@ -66,9 +66,11 @@ LEAST_ALIKE = 0.5
 # Length of a step below which the offset of the clocks is found, s.
 CLOCK_SETTLED_S = 2e-5
 MOST_CLOCK_STEPS = 12
-# A gap of more periods is counted only with the period that frames on either side of it have.
+# A gap of more periods is counted only with the period that frames on either side of it have: the
+# median of their gaps is off by some thousandths, which over so many is a tenth of a period.
 LONGEST_COUNTED = 100
-# Of all frames the share whose stamps are within half a period of a constant rate.
+# Of all frames the share whose stamps are within half a period of a constant rate: beyond that the
+# number of a frame is not sure. A few are later where a host was held up.
 AT_A_RATE = 0.99
 # Longest step, s: beyond it the tangent is not valid.
 LONGEST_CLOCK_STEP_S = 0.05

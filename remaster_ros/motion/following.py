@@ -71,7 +71,7 @@ class Seen:
     def after(
         cls, last: Seen | None, report: JointReport, rules: SupervisorRules, late_s: float
     ) -> Seen:
-        """Return what is known after a report; ``last``: before it, None for the first.
+        """Return the arm's state after a report; ``last``: state before it, None at first.
 
         Robot time goes on by the stamps. The standstill begins anew after a motion of more than
         `still_tolerance`, or a gap of more than `max_gap_s`. ``late_s``: of `JointReports.late_s`.

@@ -256,7 +256,7 @@ class CompensatorNode(RemasterNode):
         self._described = self._described_trouble()
 
     def _described_trouble(self) -> str:
-        """Return how the robot description contradicts the correction; '' if it does not.
+        """Return the contradiction of robot description and correction; '' if there is none.
 
         Also if nobody has published one, or if it holds the correction already (`NEARER`).
         """

@@ -20,7 +20,8 @@ from remaster_ros.discovery.effects.sizes import at_most
 from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import FloatArray
 
-# Knots over the range of the places: a rail errs over the distance of its bolts, or more.
+# Knots over the range of the places, as of all free forms without a name (`unnamed.FREE_KNOTS`): a
+# rail errs over the distance of its bolts, or more.
 KNOTS = 10
 
 
