@@ -13,6 +13,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.simulation.hidden_effects import (
     KINDS,
     NAMED,
+    OF_SLIDES,
     DrawContext,
     HiddenEffect,
     in_own_units,
@@ -109,6 +110,8 @@ def draw_effect(
     drawn_from = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
     )
+    if kind in OF_SLIDES and not stage.arm.slides.any():
+        raise InputError(f'{kind}: no joint of this arm slides')
     best, best_size = None, 0.0
     for _ in range(TRIES if joint is None else TRIES * stage.arm.joints):
         drawn = KINDS[kind].draw(kind, drawn_from)

@@ -100,6 +100,11 @@ def test_what_cannot_be_hidden_is_refused(text):
         EffectSpec.parse(text)
 
 
+def test_a_guide_is_hidden_only_where_a_joint_slides(stage):
+    with pytest.raises(InputError, match='crooked_guide: no joint of this arm slides'):
+        hide(stage, [EffectSpec.parse('crooked_guide')], np.random.default_rng(SEED))
+
+
 def test_a_joint_that_cannot_show_it_is_refused(stage):
     with pytest.raises(InputError, match='backlash@9: the arm has 7 joints; give 1 to 7'):
         hide(stage, [EffectSpec.parse('backlash@9')], np.random.default_rng(SEED))
