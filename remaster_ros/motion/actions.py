@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.motion_gate import Admitted
 from remaster_ros.motion.path_check import FreePath
@@ -21,6 +23,8 @@ class CheckPath:
     start: FloatArray
     target: FloatArray
     waypoints: FloatArray  # What the planner would go through, (n, k)
+    # Of a curve through the waypoints, which begins at the first: their shares, (n,); else (0,)
+    shares: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class Stop:
     admitted: Admitted
     reason: str
     wall_s: float
+    begins_s: float = 0.0  # As of a `Drive`
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from remaster_ros.motion.motion_gate import MotionGate, MotionRefusedError, Star
 from remaster_ros.motion.motion_under_way import MotionUnderWay
 from remaster_ros.motion.move_queue import (
     NO_REFUSALS,
+    NO_SHARES,
     NO_WAYPOINTS,
     PROBE,
     STANDING,
@@ -159,16 +160,18 @@ class ArmSupervisor:
         wall_s: float,
         waypoints: Mapping[int, FloatArray] = NO_WAYPOINTS,
         refused: Mapping[int, str] = NO_REFUSALS,
+        shares: Mapping[int, FloatArray] = NO_SHARES,
     ) -> list[Action]:
         """Begin to visit the solutions of a pose, rad or m, (m, k), in this order; m = 0: stop.
 
         A move under way is stopped first. ``waypoints`` has configurations on the way to a
-        solution, (n, k), by its number, from 0; ``refused`` why one of them must not be commanded.
-        ``wall_s``: now, wall time, s.
+        solution, (n, k), by its number, from 0; ``shares`` their shares of a curve, (n,), if the
+        way is one, which begins at the first of them; ``refused`` why a solution must not be
+        commanded. ``wall_s``: now, wall time, s.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
         actions += self._step(Event.NEW_POSE)
-        self._queue.begin(solutions, waypoints, refused)
+        self._queue.begin(solutions, waypoints, refused, shares)
         return actions + self.tick(wall_s)
 
     def answered(self, solution: int, wall_s: float) -> list[Action]:

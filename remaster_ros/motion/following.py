@@ -42,6 +42,8 @@ lag so far (`SupervisorRules.lag_s`) has gone more."""
 JUST_S = 0.02
 """A report is of just now that is no older, s of wall time: a piece of a move is sent for an arm
 that is seen to move, not for one that was seen to a moment ago."""
+LOOKED_FOR = 3.0
+"""On a curve the arm is looked for up to so many times as far behind and ahead as it may be."""
 LAG_CHANGES_S = 0.1
 """By so much the lag of an arm that follows may have changed in this time, s."""
 VARIES_S = 1.0
@@ -288,8 +290,8 @@ class Following:
         if since_s < least_s or not SLOWED_S <= passed_s <= SLOWED_LONGEST_S:
             return False
         units = self._rules.units
-        expected = units.largest(line.way) * min(
-            line.share(since_s + passed_s + change)[0] - line.share(since_s + change)[0]
+        expected = min(
+            units.largest(line.at(since_s + passed_s + change)[0] - line.at(since_s + change)[0])
             for change in (-LAG_CHANGES_S, 0.0, LAG_CHANGES_S)
         )
         moved = units.largest(q - q_before)
@@ -318,13 +320,14 @@ class Following:
         # Just after a rest an arm that lags may still be on the line before it.
         for number in {index, max(index - 1, 0)} if since_s < self._allowed_s else {index}:
             line = trajectory.lines[number]
-            share, off = line.project(q, units)
             begun_s = trajectory.starts_s[number]
-            expected, _ = line.share(elapsed - begun_s)
-            lag = min(elapsed - begun_s, line.duration_s) - line.time_s(share)
-            slack = ON_PATH_RAD / max(units.largest(line.way), ON_PATH_RAD)
-            beside = q - line.start - share * line.way
-            found.append((off, lag, abs(expected - share) <= slack, beside))
+            gone_s = elapsed - begun_s
+            window_s = gone_s - LOOKED_FOR * self._allowed_s, gone_s + LOOKED_FOR * self._early_s
+            share, off = line.project(q, units, window_s)
+            lag = min(gone_s, line.duration_s) - line.time_s(share)
+            place = line.place(share)
+            is_near = units.largest(line.at(gone_s)[0] - place) <= ON_PATH_RAD
+            found.append((off, lag, is_near, q - place))
         _, lag, is_near, beside = min(found, key=lambda one: one[:3])
         return lag, beside, is_near
 

@@ -20,11 +20,12 @@ import numpy as np
 from remaster_ros.errors import RemasterError
 from remaster_ros.motion.limits import LONGEST_S, MotionLimits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
-from remaster_ros.motion.pieces import AHEAD_S, Piece, in_steps, piece_of, step_of
+from remaster_ros.motion.pieces import AHEAD_S, Piece, in_steps, piece_of, step_of, stop_of
 from remaster_ros.motion.stopping import STOP_S, stop_on_line
 from remaster_ros.motion.trajectory import (
     HEADROOM,
     RAMP_S,
+    Curve,
     Line,
     Trajectory,
     Waypoint,
@@ -64,6 +65,13 @@ WAY_OUT_SPEED = 0.1
 """Share of the joint speeds on a way out of a contact or a margin."""
 WAY_OUT_TOOL_SPEED = 0.05
 """Largest speed of the fastest point on it, m/s."""
+
+
+NO_STAMPS = (
+    'a curve is gone in pieces (horizon_s), by stamps that the controller keeps '
+    '(trajectory_stamps) and that are of the clock of this computer, as those of joint_states '
+    'have to be (NTP); without them measure by stop and go'
+)
 
 
 class MotionRefusedError(RemasterError):
@@ -138,7 +146,12 @@ class MotionGate:
             if not limits.units.largest(off) <= START_RAD:
                 text = limits.units.in_radians(off, 4)
                 raise StartMovedError(f'the arm stands {text} from the start of the path')
-            trajectory = plan_trajectory(limits, path.points, path.peaks_m)
+            if path.curve is None:
+                trajectory = plan_trajectory(limits, path.points, path.peaks_m)
+            elif not (horizon_s and keeps_stamps):
+                raise MotionRefusedError(NO_STAMPS)
+            else:
+                trajectory = Trajectory((Curve.within(limits, path.curve, *path.peaks_m),))
             stands = Waypoint(0.0, q, np.zeros_like(q))
             # All of the way first: an arm is not sent where it could not go on.
             if horizon_s and not keeps_stamps:
@@ -256,6 +269,8 @@ class MotionGate:
         low_s, high_s
             Between which times since its start the arm is on the trajectory, s.
 
+        On a curve that is its straight beginning; `stop_on_curve` stops an arm behind that.
+
         Raises
         ------
         LookupError
@@ -267,11 +282,26 @@ class MotionGate:
         index, since_s = trajectory.line_at(high_s)
         low_since_s = max(low_s - trajectory.starts_s[index], 0.0)
         line = trajectory.lines[index]
+        if isinstance(line, Curve):
+            line = line.lead
         # In the rest after a line both times lie past its end.
         end_s = line.duration_s
         stop = stop_on_line(line, min(low_since_s, end_s), min(since_s, end_s), limits)
         self._under_way = None
         return Admitted((stop,))
+
+    def stop_on_curve(self, sent_s: float, cut_s: float) -> Admitted:
+        """Return a stop along the curve that is under way, as its last piece.
+
+        Another timing of what was admitted: it needs no check, and is not refused. ``sent_s,
+        cut_s``: as of `pieces.stop_of`. Raises LookupError if no move is under way.
+        """
+        if self._under_way is None:
+            raise LookupError('no move is under way')
+        trajectory, *_ = self._under_way
+        piece = stop_of(trajectory, sent_s, cut_s)
+        self._under_way = None
+        return Admitted(piece.waypoints, trajectory, piece=piece)
 
     def _check(
         self,
@@ -293,6 +323,7 @@ class MotionGate:
         points = [start, *waypoints]
         if np.any(points[-1].velocity != 0.0):
             raise MotionRefusedError('the move does not end at rest')
+        places: list[FloatArray] = []
         for before, after in pairwise(points):
             piece = Cubic.between(before, after)
             if not piece.duration_s > 0.0 or not np.all(np.isfinite(piece.coefficients)):
@@ -302,14 +333,15 @@ class MotionGate:
             largest = piece.largest_acceleration()
             _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
             self._check_point_speed(piece, limits)
-            off = path.off(after.q, units)
-            if not units.largest(off) <= ON_PATH_RAD:
-                text = units.in_radians(off, 6)
+            places += [after.q, *piece.at(np.linspace(0.0, piece.duration_s, BETWEEN))]
+        offs = path.offs(np.array(places), units).reshape(-1, BETWEEN + 1, len(q))
+        for number, (at_end, *between) in enumerate(offs):
+            if not units.largest(at_end) <= ON_PATH_RAD:
+                text = units.in_radians(at_end, 6)
                 raise MotionRefusedError(f'a waypoint lies {text} off the path found free')
             # What the arm stands off the start of the path is lost on the first piece.
-            allowed = START_RAD * np.sqrt(len(q)) if before is points[0] else 0.0
-            between = np.linspace(0.0, piece.duration_s, BETWEEN)
-            off = max((path.off(place, units) for place in piece.at(between)), key=units.largest)
+            allowed = 0.0 if number else START_RAD * np.sqrt(len(q))
+            off = max(between, key=units.largest)
             if not units.largest(off) <= allowed + ON_PATH_RAD:
                 text = units.in_radians(off, 6)
                 raise MotionRefusedError(

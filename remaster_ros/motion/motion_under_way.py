@@ -27,6 +27,7 @@ from remaster_ros.motion.pieces import (
     JOINED_S,
     RENEWED_S,
     STEP_REST_S,
+    STOP_AHEAD_S,
     Piece,
 )
 from remaster_ros.motion.settling import SettleDetector
@@ -262,7 +263,9 @@ class MotionUnderWay:
         time = seen.now(wall_s, rate)
         self._horizon_s, self._keeps_stamps = self.horizon_s, self.keeps_stamps
         piece = admitted.piece
-        has_stamp = self._keeps_stamps and piece is not None and not piece.is_last
+        # The stop of a curve is a piece with the same stamp.
+        in_pieces = trajectory.is_curve or (piece is not None and not piece.is_last)
+        has_stamp = self._keeps_stamps and in_pieces
         if has_stamp:
             # Where the last report came late more time has passed than it tells.
             time = _led_now(seen, wall_s) + seen.late_s + AHEAD_S
@@ -348,7 +351,7 @@ class MotionUnderWay:
         """
         assert self.visit is not None
         assert self._piece is not None
-        begins = self.visit.following.sent + self._piece.cut_s
+        begins = self.visit.following.sent + min(self._piece.cut_s, self._piece.end_s)
         over = self.visit.following.sent + self._piece.end_s + allowed_lag_s(self.rules, rate)
         self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
@@ -401,6 +404,8 @@ class MotionUnderWay:
         if following.has_ended(seen, wall_s, rate):
             return None
         low_s, high_s = following.window(seen, wall_s, rate)
+        if following.trajectory.is_curve and high_s >= JOINED_S:
+            return self._stop_on_curve(reason, seen, wall_s, rate)
         if self._piece is not None:
             # Behind that it is on the stop of its piece.
             high_s = min(high_s, self._piece.cut_s)
@@ -411,6 +416,25 @@ class MotionUnderWay:
         self._set_back_s = 0.0
         self.led.lead_to(stop.q)
         return Stop(admitted, reason, wall_s)
+
+    def _stop_on_curve(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop:
+        """Return the stop of an arm on a curve, as a piece of the same function of time.
+
+        It begins `STOP_AHEAD_S` from now, or where the present piece ends in its own stop.
+        Arguments as of `stop`.
+        """
+        assert self.visit is not None
+        assert self._piece is not None
+        following = self.visit.following
+        sent_s = following.elapsed_s(_led_now(seen, wall_s)) + seen.late_s
+        # Before that the controller joins the curve from where the arm stood.
+        cut_s = min(max(sent_s, JOINED_S) + STOP_AHEAD_S, self._piece.cut_s)
+        admitted = self.gate.stop_on_curve(min(sent_s, cut_s), cut_s)
+        assert admitted.piece is not None
+        self._take(admitted.piece, sent_s)
+        self.end_piece(seen, wall_s, rate)
+        self.led.lead_to(admitted.piece.end)
+        return Stop(admitted, reason, wall_s, following.sent)
 
     def _brake(self, end: FloatArray, begins: float, over: float, rate: float) -> None:
         """Begin to watch a stop at `end`, (k,), from `begins` to `over`, robot time, s.

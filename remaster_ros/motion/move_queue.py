@@ -24,6 +24,8 @@ PROBE_RAD = 1e-6
 """How far the probe goes, rad, a slide a quarter of a micrometre: less than the arm repeats, more
 than the last bit."""
 NO_WAYPOINTS: Mapping[int, FloatArray] = {}
+NO_SHARES: Mapping[int, FloatArray] = {}
+"""Shares of the curves through the waypoints, by solution; none for straight lines."""
 NO_REFUSALS: Mapping[int, str] = {}
 
 
@@ -36,7 +38,7 @@ class MoveQueue:
 
     def __init__(self) -> None:
         self._solutions: FloatArray | tuple[()] = ()
-        self._waypoints = NO_WAYPOINTS
+        self._waypoints, self._shares = NO_WAYPOINTS, NO_SHARES
         self._refused = NO_REFUSALS
         self.next = 0
         self._requests = 0
@@ -52,13 +54,15 @@ class MoveQueue:
         solutions: FloatArray,
         waypoints: Mapping[int, FloatArray],
         refused: Mapping[int, str],
+        shares: Mapping[int, FloatArray] = NO_SHARES,
     ) -> None:
         """Begin another pose, with its first solution next; see `ArmSupervisor.plan`.
 
-        ``waypoints``: on the way to a solution, ``refused``: why one is not visited, by its index.
+        ``waypoints``: on the way to a solution, ``refused``: why one is not visited, ``shares``:
+        of a curve through the waypoints, each by the solution's index.
         """
         self._solutions, self._waypoints, self.next = solutions, waypoints, 0
-        self._refused = refused
+        self._refused, self._shares = refused, shares
 
     def found(self, finding: Finding) -> None:
         """Process a finding about the arm's place, by the table `states.PLACE`."""
@@ -97,7 +101,9 @@ class MoveQueue:
         """
         self._requests += 1
         none = np.empty((0, len(target)))
-        asked = CheckPath(self._requests, start, target, self._waypoints.get(solution, none))
+        waypoints = self._waypoints.get(solution, none)
+        shares = self._shares.get(solution, np.empty(0))
+        asked = CheckPath(self._requests, start, target, waypoints, shares)
         self._asked = solution, asked
         return asked
 

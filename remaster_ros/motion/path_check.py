@@ -15,6 +15,7 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import with_z_along
 from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.motion.spline import Spline
 from remaster_ros.types import FloatArray
 
 PEAK_STEP_RAD = 0.02
@@ -130,13 +131,24 @@ def _velocities(points: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class FreePath:
-    """A polyline in joint space that was found free."""
+    """A polyline or a curve in joint space that was found free."""
 
-    points: FloatArray  # From where the arm stands to the target, rad or m, (n, k)
-    # For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,);
-    # none if no such limit is kept
+    # From where the arm stands to the target, rad or m, (n, k); of a curve its samples
+    points: FloatArray
+    # For each line the peak speed of the fastest point where it takes a second, m/s, (n - 1,),
+    # for a curve that of all of it, (1,); none if no such limit is kept
     peaks_m: tuple[float, ...] = ()
     way_out: bool = False  # It leads out of a contact or a margin, and is gone slowly
+    curve: Spline | None = None  # What the arm follows in place of the polyline
+
+    def offs(self, q: FloatArray, units: JointUnits) -> FloatArray:
+        """Return the ways to configurations from the nearest places on the path, rad or m, (n, k).
+
+        On a curve the nearest by the sum of squares, on a polyline as of `off`.
+        """
+        if self.curve is not None:
+            return np.asarray(q - self.curve.at(self.curve.nearest(q, units)))
+        return np.array([self.off(each, units) for each in q])
 
     def off(self, q: FloatArray, units: JointUnits) -> FloatArray:
         """Return the way to a configuration (rad or m, (k,)) from the nearest on the polyline.

@@ -8,9 +8,14 @@ import numpy as np
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import free_path, way_out
 from remaster_ros.motion.actions import CheckPath, PathAnswer
+from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
+from remaster_ros.motion.spline import SAGITTA_RAD, Spline
 
 SEED = 20
+BEGINS_RAD = 0.02
+"""An arm stands where a curve begins if no joint is further off, rad: ten times what counts as
+arrived by default. The curve that is checked begins where it stands."""
 
 
 class PathSearch:
@@ -39,14 +44,43 @@ class PathSearch:
             out = way_out(self._model, request.start, rng)
             path = None if out is None else self._path(out, is_way_out=True)
             return PathAnswer(None, at_start, at_start=True, way_out=path)
-        points = np.vstack([request.start, request.waypoints, request.target])
+        curve = self._curve(request)
+        if curve is not None:
+            return PathAnswer(curve)
+        waypoints = request.waypoints[: 0 if len(request.shares) else None]
+        points = np.vstack([request.start, waypoints, request.target])
         trouble = self._model.path_trouble(points)
         if not trouble:
             return PathAnswer(self._path(points))
-        found = free_path(
-            self._model, request.start, request.target, rng, hints=list(request.waypoints)
-        )
+        found = free_path(self._model, request.start, request.target, rng, hints=list(waypoints))
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
+
+    def _curve(self, request: CheckPath) -> FreePath | None:
+        """Return the curve of a request as a path; None without one, or if it is not free.
+
+        Nor is there one for an arm that stands elsewhere than at its beginning (`BEGINS_RAD`):
+        it was stopped on its way, say, and goes to the target by any free path.
+        """
+        shares, points = request.shares, request.waypoints
+        if not len(shares):
+            return None
+        units = JointUnits.of(self._model.chain)
+        if units.largest(request.start - points[0]) > BEGINS_RAD:
+            return None
+        # From where the arm stands: the servo leaves it a little off.
+        through = np.vstack([request.start, points[1:], request.target])
+        spline = Spline.through(through, np.append(shares, 1.0))
+        samples = spline.samples[1]
+        if self._model.path_trouble(samples, self.beside_m):
+            return None
+        fastest = self._speeds.fastest(samples, spline.at(spline.samples[0], 1))
+        return FreePath(samples, (float(np.max(fastest)),), curve=spline)
+
+    @property
+    def beside_m(self) -> float:
+        """How far a body may be beside its place on the chords of a curve's samples, m."""
+        chain = self._model.chain
+        return self._model.travel(np.zeros(len(chain)), SAGITTA_RAD * chain.per_radian)
 
     def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
         """Return points (n, k) as a path, with the peak speeds of its lines.

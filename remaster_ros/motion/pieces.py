@@ -36,6 +36,9 @@ would ask for a place that the arm has left. `following.LATENCY_S` and as much a
 AHEAD_S = 0.1
 """With a stamp a move begins so long after it was decided, s: it may come at once, or twice as
 late as that, and no joint is faster or harder on its first ramp than its limits allow."""
+STOP_AHEAD_S = 0.1
+"""On a curve a stop begins so long after it was decided, s: as late as one may be published
+(`LATE_WALL_S` of the bridge); the arm is still on the curve then."""
 LEAST_PAST_S = 0.1
 """So long before at the least, s."""
 JOINED_S = RAMP_S + LEAST_PAST_S
@@ -89,6 +92,16 @@ def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
     return Piece(*piece, following[-1].q)
 
 
+def stop_of(trajectory: Trajectory, sent_s: float, cut_s: float) -> Piece:
+    """Return the piece that stops an arm on a curve, if the curve does not end before.
+
+    ``sent_s``: when it is sent, ``cut_s``: from where on it differs from the curve, both s from
+    the trajectory's start. The controller is on the curve when the piece comes, and goes on.
+    """
+    points, cut_s = _piece(trajectory, sent_s, cut_s - sent_s + RAMP_S)
+    return Piece(points, cut_s, points[-1].q)
+
+
 def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
     """Return a trajectory along the same lines that rests every `horizon_s` at the latest.
 
@@ -96,6 +109,7 @@ def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
     """
     lines: list[Line] = []
     for line in trajectory.lines:
+        assert isinstance(line, Line), 'a curve is not cut into steps'
         count = max(int(np.ceil((1.0 / line.rate) / (horizon_s - RAMP_S) - SAME_S)), 1)
         places = line.start + np.linspace(0.0, 1.0, count + 1)[:, None] * line.way
         # The ends as they are, to the last bit.
@@ -140,8 +154,6 @@ def _piece(
         over_s = start_s + line.duration_s
         resting_s = trajectory.starts_s[index + 1] if index + 1 < len(trajectory.lines) else np.inf
         return tuple(p for p in points if p.time_s <= over_s + SAME_S), resting_s
-    q, velocity = trajectory.at(cut_s)
     points = [p for p in points if p.time_s < cut_s - SAME_S]
-    # As even as the line's own ramps: no faster than its cruising speed, in the same time.
-    stop = Waypoint(cut_s + RAMP_S, q + 0.5 * RAMP_S * velocity, np.zeros_like(q))
-    return (*points, Waypoint(cut_s, q, velocity), stop), cut_s
+    stop = (replace(p, time_s=cut_s + p.time_s) for p in line.brake(since_s))
+    return (*points, Waypoint(cut_s, *trajectory.at(cut_s)), *stop), cut_s

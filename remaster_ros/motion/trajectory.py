@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories: straight lines in joint space, each from rest to rest.
+"""Trajectories: straight lines and curves in joint space, each from rest to rest.
 
 A controller joins positions and velocities by cubics, as joint_trajectory_controller does; it then
-follows the ramps of a line at constant acceleration, and never leaves the line.
+follows the ramps of a line at constant acceleration, and never leaves the line. A curve is a cubic
+spline, of which it follows each piece; its ramps are on its straight ends.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.motion.limits import LONGEST_S, MotionLimits
+from remaster_ros.motion.spline import Spline
 from remaster_ros.types import FloatArray
 
 RAMP_S = 0.5
@@ -29,8 +31,18 @@ little, and the first cubic begins there."""
 STOPPABLE = 0.42
 """Share of the allowed accelerations that a line is planned with: a stop of an arm that lags may
 have to brake harder than the line does."""
+LEAD_S = 0.9
+"""The straight piece at the beginning of a curve takes so long at its cruising speed, s: until
+a piece of it can be replaced (`pieces.JOINED_S`) the arm is stopped on a line."""
+BRAKE_STEP_S = 0.02
+"""A stop on a curve has a waypoint after each such time, s: the cubics between are within some
+1e-7 rad of the curve where joints accelerate at some rad/s²."""
 NO_CRUISE = 1.0 - 2.0**-20
 """Ramps that take this share of the way have none between them: two waypoints need two times."""
+
+
+ALWAYS = (0.0, LONGEST_S)
+"""From the start of any motion to its end, s."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +55,53 @@ class Waypoint:
 
 
 @dataclass(frozen=True)
-class Line:
-    """A straight line in joint space: ramp up, cruise, ramp down; all joints arrive together."""
+class RampedPath:
+    """A path from rest to rest: its share goes up a ramp, cruises, and goes down a ramp."""
 
     # Joint positions at rest, rad or m, (k,)
     start: FloatArray
     end: FloatArray
-    rate: float  # Share of the way per second while cruising, 1/s; at most 1/`RAMP_S`
+    rate: float  # Share of the path per second while cruising, 1/s; at most 1/`RAMP_S`
+
+    @property
+    def cruise_s(self) -> float:
+        """Time between the two ramps, s."""
+        return 1.0 / self.rate - RAMP_S
+
+    @property
+    def duration_s(self) -> float:
+        """Time from start to end, s."""
+        return self.cruise_s + 2 * RAMP_S
+
+    @property
+    def kinks_s(self) -> tuple[float, float]:
+        """When the ramp up ends and when the ramp down begins, s."""
+        return RAMP_S, RAMP_S + self.cruise_s
+
+    def share(self, time_s: float) -> tuple[float, float]:
+        """Return the share of the path covered at a time, s since its start, and its rate, 1/s.
+
+        Before the start 0, after the end 1, at rate 0.
+        """
+        # The speed goes up from the start, and down by as much from where it is to be lost.
+        up, gone_up = _ramp(time_s)
+        down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
+        return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
+
+    def time_s(self, share: float) -> float:
+        """Return when a share of the path is gone, s: the inverse of `share`, clipped to 0 … 1."""
+        share = min(max(share, 0.0), 1.0)
+        ramp = 0.5 * RAMP_S * self.rate
+        if share <= ramp:
+            return float(np.sqrt(2 * RAMP_S * share / self.rate))
+        if share >= 1.0 - ramp:
+            return self.duration_s - float(np.sqrt(2 * RAMP_S * (1.0 - share) / self.rate))
+        return 0.5 * RAMP_S + share / self.rate
+
+
+@dataclass(frozen=True)
+class Line(RampedPath):
+    """A straight line in joint space; all joints arrive together."""
 
     @classmethod
     def within(
@@ -77,19 +129,14 @@ class Line:
         return self.end - self.start
 
     @property
-    def cruise_s(self) -> float:
-        """Time between the two ramps, s."""
-        return 1.0 / self.rate - RAMP_S
+    def corners(self) -> FloatArray:
+        """Places between which the path is straight, rad or m: its ends, (2, k)."""
+        return np.array([self.start, self.end])
 
-    @property
-    def duration_s(self) -> float:
-        """Time from start to end, s."""
-        return self.cruise_s + 2 * RAMP_S
-
-    @property
-    def kinks_s(self) -> tuple[float, float]:
-        """When the ramp up ends and when the ramp down begins, s."""
-        return RAMP_S, RAMP_S + self.cruise_s
+    def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return joint positions, rad or m, and velocities, per s, at a time, s, (k,) each."""
+        share, rate = self.share(time_s)
+        return self.start + share * self.way, rate * self.way
 
     def waypoints(self) -> tuple[Waypoint, ...]:
         """Return the ends of ramp up, cruise and ramp down; no cruise if there is none."""
@@ -100,36 +147,121 @@ class Line:
         points.append(Waypoint(self.duration_s, self.end, np.zeros_like(self.end)))
         return tuple(points)
 
-    def share(self, time_s: float) -> tuple[float, float]:
-        """Return the share of the line covered at a time, s since its start, and its rate, 1/s.
+    def brake(self, time_s: float) -> tuple[Waypoint, ...]:
+        """Return the waypoint of a stop in `RAMP_S` on the line from a time on, s since its start.
 
-        Before the start 0, after the end 1, at rate 0.
+        As even as the line's own ramps; the waypoint's time is since the stop's beginning.
         """
-        # The speed goes up from the start, and down by as much from where it is to be lost.
-        up, gone_up = _ramp(time_s)
-        down, gone_down = _ramp(time_s - RAMP_S - self.cruise_s)
-        return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
+        q, velocity = self.at(time_s)
+        return (Waypoint(RAMP_S, q + 0.5 * RAMP_S * velocity, np.zeros_like(q)),)
 
-    def time_s(self, share: float) -> float:
-        """Return when a share of the way is gone, s: the inverse of `share`, clipped to 0 … 1."""
-        share = min(max(share, 0.0), 1.0)
-        ramp = 0.5 * RAMP_S * self.rate
-        if share <= ramp:
-            return float(np.sqrt(2 * RAMP_S * share / self.rate))
-        if share >= 1.0 - ramp:
-            return self.duration_s - float(np.sqrt(2 * RAMP_S * (1.0 - share) / self.rate))
-        return 0.5 * RAMP_S + share / self.rate
-
-    def project(self, q: FloatArray, units: JointUnits = TURNING) -> tuple[float, float]:
+    def project(
+        self, q: FloatArray, units: JointUnits = TURNING, window_s: tuple[float, float] = ALWAYS
+    ) -> tuple[float, float]:
         """Return the share of the way (0 to 1) nearest to `q` (k,), and how far `q` is off, rad.
 
         Nearest by the sum of squares; the distance is of the farthest joint. A line without a way
-        has the share 1.
+        has the share 1. ``window_s``: as of `Curve.project`; a line has one nearest place.
         """
         way, gone = self.way / units.per_radian, (q - self.start) / units.per_radian
         length = float(way @ way)
         share = float(np.clip(way @ gone / length, 0.0, 1.0)) if length else 1.0
         return share, float(np.max(np.abs(gone - share * way)))
+
+    def place(self, share: float) -> FloatArray:
+        """Return the configuration at a share of the way, rad or m, (k,)."""
+        return self.start + share * self.way
+
+
+@dataclass(frozen=True, eq=False)
+class Curve(RampedPath):
+    """A spline gone at a constant rate of its share, but for the ramps."""
+
+    spline: Spline
+
+    @classmethod
+    def within(cls, limits: MotionLimits, spline: Spline, peak_m: float = 0.0) -> Curve:
+        """Return the fastest motion along a spline within the limits, less `HEADROOM`.
+
+        At every place within the speeds, and within the accelerations also of a stop in `RAMP_S`
+        from there. The straight piece at the beginning takes at least `LEAD_S`, and that at the
+        end holds the ramp. ``peak_m``: as of `Line.within`.
+        """
+        shares, _ = spline.samples
+        first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
+        speed = np.max(first / limits.velocity)
+        # r² |q''| + r |q'| / RAMP_S = a, solved for the rate r in a form that needs no q''.
+        a, b = HEADROOM * limits.acceleration, first / RAMP_S
+        rates = 2.0 * a / (b + np.sqrt(b**2 + 4.0 * second * a) + 1e-300)
+        rate = min(
+            float(HEADROOM / max(speed, 1e-12)),
+            float(np.min(rates)),
+            spline.straight_until / LEAD_S,
+            (1.0 - spline.straight_from) / RAMP_S,
+        )
+        if peak_m > 0.0:
+            rate = min(rate, HEADROOM * limits.tool_speed / peak_m)
+        return cls(spline.start, spline.end, max(rate, 0.1 / LONGEST_S), spline)
+
+    @property
+    def lead(self) -> Line:
+        """The straight piece at the beginning, as a line of the same motion.
+
+        Until the line's ramp down, which the curve does not have.
+        """
+        until = self.spline.straight_until
+        return Line(self.start, self.place(until), self.rate / until)
+
+    @property
+    def corners(self) -> FloatArray:
+        """Places between which the path is nearly straight (`SAGITTA_RAD`), rad or m, (p, k)."""
+        return self.spline.samples[1]
+
+    def at(self, time_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return joint positions, rad or m, and velocities, per s, at a time, s, (k,) each."""
+        share, rate = self.share(time_s)
+        return self.place(share), rate * self.spline.at(np.array([share]), 1)[0]
+
+    def place(self, share: float) -> FloatArray:
+        """Return the configuration at a share of the curve, rad or m, (k,)."""
+        return self.spline.at(np.array([share]))[0]
+
+    def waypoints(self) -> tuple[Waypoint, ...]:
+        """Return the end of the ramp up, the spline's knots, the ramp's begin, and the end.
+
+        Between two of them the curve is one cubic of time.
+        """
+        begins_s, ends_s = self.kinks_s
+        low, high = self.share(begins_s)[0], self.share(ends_s)[0]
+        inner = self.spline.knots[(self.spline.knots > low) & (self.spline.knots < high)]
+        times = [begins_s, *map(self.time_s, inner), ends_s]
+        moving = [Waypoint(time_s, *self.at(time_s)) for time_s in times]
+        return (*moving, Waypoint(self.duration_s, self.end, np.zeros_like(self.end)))
+
+    def brake(self, time_s: float) -> tuple[Waypoint, ...]:
+        """Return the waypoints of a stop in `RAMP_S` along the curve from a time on.
+
+        The rate of the share falls evenly; the waypoints' times are since the stop's beginning.
+        """
+        share, rate = self.share(time_s)
+        since = np.linspace(0.0, RAMP_S, round(RAMP_S / BRAKE_STEP_S) + 1)[1:]
+        shares = share + rate * since * (1.0 - since / (2.0 * RAMP_S))
+        rates = rate * (1.0 - since / RAMP_S)
+        rates[-1] = 0.0
+        velocities = rates[:, None] * self.spline.at(shares, 1)
+        return tuple(map(Waypoint, since.tolist(), self.spline.at(shares), velocities))
+
+    def project(
+        self, q: FloatArray, units: JointUnits = TURNING, window_s: tuple[float, float] = ALWAYS
+    ) -> tuple[float, float]:
+        """Return the share nearest to `q` (k,), and how far `q` is off, rad.
+
+        ``window_s``: times since the start between which the place is looked for, s: a curve may
+        cross itself, or come near itself. Distances as of `Line.project`.
+        """
+        low, high = (self.share(time_s)[0] for time_s in window_s)
+        share = float(self.spline.nearest(q[None], units, low, high)[0])
+        return share, units.largest(q - self.place(share))
 
 
 def _ramp(time_s: float) -> tuple[float, float]:
@@ -143,9 +275,9 @@ def _ramp(time_s: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Lines one after the other, with a rest between them."""
+    """Lines one after the other, with a rest between them; or a curve."""
 
-    lines: tuple[Line, ...]
+    lines: tuple[Line | Curve, ...]
     rest_s: float = REST_S  # Between two lines
 
     @cached_property
@@ -168,8 +300,13 @@ class Trajectory:
 
     @property
     def points(self) -> FloatArray:
-        """The polyline, rad or m, (n + 1, k) for n lines."""
-        return np.array([self.lines[0].start, *(line.end for line in self.lines)])
+        """The polyline, rad or m, (n + 1, k) for n lines; of a curve its samples."""
+        return np.concatenate([self.start[None], *(line.corners[1:] for line in self.lines)])
+
+    @property
+    def is_curve(self) -> bool:
+        """Whether it is a curve."""
+        return isinstance(self.lines[0], Curve)
 
     @property
     def duration_s(self) -> float:
@@ -204,9 +341,7 @@ class Trajectory:
         Before the start and after the end the arm stands.
         """
         index, since_s = self.line_at(time_s)
-        line = self.lines[index]
-        share, rate = line.share(since_s)
-        return line.start + share * line.way, rate * line.way
+        return self.lines[index].at(since_s)
 
 
 def plan_trajectory(

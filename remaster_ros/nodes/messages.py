@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from remaster_ros.planning.tour_order import PoseVisit
 
 
+SHARES = 999_999_998
+"""The share of a curve that a waypoint has is told in so many parts, as nanoseconds less one."""
 LARGEST_PART = 1e6
 """The largest part of a quaternion is no larger, nor smaller than the reciprocal: any program
 leaves it nearer to 1, and the squares are numbers."""
@@ -97,17 +99,46 @@ def waypoints_message(
     """Return remaster/joint_waypoints of a stop.
 
     The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
-    + the index of the solution they lead to, as in joint_solutions. Empty where all ways are
+    + the index of the solution they lead to, as in joint_solutions; ``nanosec`` is 0 for a corner
+    of straight lines, and 1 + `SHARES` times the share of a curve. Empty where all ways are
     straight.
     """
     message = JointTrajectory(joint_names=list(joint_names))
     message.header = header
-    message.points = [
-        JointTrajectoryPoint(positions=q.tolist(), time_from_start=duration_of(i + 1.0))
-        for i, path in enumerate(stop.paths)
-        for q in path
-    ]
+    for i, path in enumerate(stop.paths):
+        shares = stop.shares[i] if i < len(stop.shares) else ()
+        marks = 1 + np.round(np.multiply(shares, SHARES)).astype(int) if len(shares) else ()
+        times = [Duration(sec=i + 1, nanosec=int(mark)) for mark in marks]
+        message.points += [
+            JointTrajectoryPoint(positions=q.tolist(), time_from_start=time)
+            for q, time in zip(path, times or [duration_of(i + 1.0)] * len(path), strict=True)
+        ]
     return message
+
+
+def curves_by_solution(message: JointTrajectory) -> dict[int, FloatArray]:
+    """Return the shares of the curves of remaster/joint_waypoints by the solution's index.
+
+    Solution, from 0 -> share of each of its waypoints, (n,), n >= 2, ascending from 0 to below 1;
+    solutions that are reached by straight lines are left out. Raises InputError for others.
+    """
+    marks: dict[int, list[int]] = {}
+    for point in message.points:
+        time = point.time_from_start
+        marks.setdefault(time.sec - 1, []).append(time.nanosec)
+    found = {}
+    for index, of_points in marks.items():
+        if not any(of_points):
+            continue
+        shares = (np.array(of_points) - 1) / SHARES
+        ascends = bool(np.all(np.diff(shares) > 0.0))
+        if len(shares) < 2 or shares[0] != 0.0 or not ascends or shares[-1] >= 1.0:
+            raise InputError(
+                f'joint_waypoints: the shares of the curve to solution {index} must ascend from 0 '
+                f'to below 1, of two points and more; they are {shares.tolist()[:5]}'
+            )
+        found[index] = shares
+    return found
 
 
 def waypoints_by_solution(

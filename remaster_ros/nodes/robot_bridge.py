@@ -69,7 +69,12 @@ from remaster_ros.nodes.controller_link import (
     TopicLink,
     control_messages,
 )
-from remaster_ros.nodes.messages import duration_of, stamp_of, waypoints_by_solution
+from remaster_ros.nodes.messages import (
+    curves_by_solution,
+    duration_of,
+    stamp_of,
+    waypoints_by_solution,
+)
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
@@ -568,6 +573,7 @@ class RobotBridge(RemasterNode):
             belongs = self._waypoints.header.stamp == message.header.stamp
             names = self.chain.joint_names
             waypoints = waypoints_by_solution(self._waypoints, names) if belongs else {}
+            shares = curves_by_solution(self._waypoints) if belongs else {}
         except InputError as error:
             self.get_logger().error(f'joint_solutions dropped: {error}')
             return
@@ -601,7 +607,7 @@ class RobotBridge(RemasterNode):
             for note in done.notes:
                 self.get_logger().info(note)
         self._pose_stamp = stamp_key(message.header.stamp)
-        self._do(self.supervisor.plan(targets, self.steady_s(), waypoints, refused))
+        self._do(self.supervisor.plan(targets, self.steady_s(), waypoints, refused, shares))
 
     def _on_joint_state(self, message: JointState, info: Mapping[str, Any]) -> None:
         """Process a report of the joints, then count its message as taken."""
@@ -806,8 +812,7 @@ class RobotBridge(RemasterNode):
         """Publish a command; if that fails, tell the supervisor and raise the exception again."""
         try:
             kind = {Stop: 'stop', Renew: 'renewal', Drive: 'move'}[type(command)]
-            begins_s = 0.0 if isinstance(command, Stop) else command.begins_s
-            self._publish(command.admitted, kind, begins_s)
+            self._publish(command.admitted, kind, command.begins_s)
         except Exception:
             self._do(self.supervisor.not_sent(command, self.steady_s()))
             raise

@@ -91,6 +91,15 @@ class LineOfSight:
 
 
 @dataclass(frozen=True)
+class CurvedWay:
+    """A curve to a configuration (`motion.spline`), measured while the arm moves along it."""
+
+    # Where it begins, and what it goes through before its end, rad or m, (n, k), n >= 2
+    points: FloatArray
+    shares: FloatArray  # Of the curve, at these points, (n,), ascending from 0; the end has 1
+
+
+@dataclass(frozen=True)
 class PlannedPose:
     """A tool pose and its usable joint solutions."""
 
@@ -98,6 +107,8 @@ class PlannedPose:
     solutions: FloatArray  # rad, (m, k), m >= 1
     # State that the bridge's correction must have at this pose; '' for either
     correction: Literal['', 'on', 'off'] = ''
+    # By which the arm comes to the only solution; None if any free path will do
+    way: CurvedWay | None = None
 
 
 @dataclass(frozen=True)

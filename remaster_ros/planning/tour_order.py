@@ -36,6 +36,8 @@ class Route(NamedTuple):
     # rad, (n, k); n = 0 if the straight path is free
     paths: Sequence[FloatArray]
     unreached: Sequence[int]  # Indices of solutions without a free path
+    # Of a path that is a curve (`CurvedWay`) the shares of its points, (n,); () if none is
+    shares: Sequence[FloatArray] = ()
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class PoseVisit:
     paths: tuple[FloatArray, ...] = ()
     unreached: tuple[int, ...] = ()
     correction: str = ''  # See `PlannedPose`
+    shares: tuple[FloatArray, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.paths:
@@ -281,7 +284,7 @@ class Tour:
         Not checked: the tour must be in the state in which the visit was proposed.
         """
         p = proposed
-        return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached)
+        return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached, p.shares)
 
     def reroute(self, visit: PoseVisit, q: FloatArray) -> PoseVisit:
         """Return a visit with new paths to its solutions, and their new order, from q."""
@@ -293,9 +296,10 @@ class Tour:
         ids: Sequence[int],
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
+        shares: Sequence[FloatArray] = (),
     ) -> PoseVisit:
         """Return a visit to the same pose with another route (see `Route`); nothing is counted."""
-        other = self._visit(visit.split, visit.index, Route(ids, paths, unreached))
+        other = self._visit(visit.split, visit.index, Route(ids, paths, unreached, shares))
         return replace(other, pose=visit.pose)
 
     def record_visit(
@@ -305,6 +309,7 @@ class Tour:
         ids: Sequence[int],
         paths: Sequence[FloatArray] = (),
         unreached: Sequence[int] = (),
+        shares: Sequence[FloatArray] = (),
     ) -> PoseVisit:
         """Count a visit to a planned pose as made, and return it; `Route` has the arguments.
 
@@ -313,7 +318,7 @@ class Tour:
         KeyError for a pose that is done already. ``split, index``: the pose's plan, and its index
         there.
         """
-        visit = self._visit(split, index, Route(ids, paths, unreached))
+        visit = self._visit(split, index, Route(ids, paths, unreached, shares))
         if split == REFERENCE:
             self._begin_reference(index)
         else:
@@ -369,7 +374,16 @@ class Tour:
         ids, paths, unreached = tuple(route.ids), tuple(route.paths), tuple(route.unreached)
         solutions = pose.solutions[list(ids)]
         return PoseVisit(
-            number, split, pose.T_R_T, solutions, index, ids, paths, unreached, pose.correction
+            number,
+            split,
+            pose.T_R_T,
+            solutions,
+            index,
+            ids,
+            paths,
+            unreached,
+            pose.correction,
+            tuple(route.shares),
         )
 
     def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
@@ -382,7 +396,12 @@ class Tour:
         if split == REFERENCE:
             waypoints = self._route_to_reference(index, q) if ids else None
             return Route((), (), ids) if waypoints is None else Route(ids, [waypoints], ())
-        solutions = self.plans[split].poses[index].solutions[ids]
+        pose = self.plans[split].poses[index]
+        if pose.way is not None and ids:
+            units = JointUnits.of(self.chain)
+            if nearest_solution(pose.way.points[:1], q, units) is not None:
+                return Route(ids, [pose.way.points], (), [pose.way.shares])
+        solutions = pose.solutions[ids]
         # Seeded by the pose, so that a tour is repeatable.
         rng = np.random.default_rng([index, *split.encode()])
         order, paths = free_order(

@@ -159,12 +159,12 @@ class Motion:
 
         ``waypoints``: at times from `start_s`, which increase; the last one is held.
         ``reference_now``: position and velocity of the trajectory at `start_s`, (k,) each; None if
-        it begins at the arm's position. Only the last 16 pieces of the motion are kept.
+        it begins at the arm's position. Of the motion before it the last 16 pieces are kept.
         """
         # A later trajectory replaces the future of the former one.
-        self._responses = [r for r in self._responses if r.start_s <= start_s] or [
-            self._responses[0]
-        ]
+        past = [r for r in self._responses if r.start_s <= start_s] or self._responses[:1]
+        # The past is read back for seconds at most; memory stays bounded over hours of collection.
+        self._responses = past[-16:]
         x, v = self.at(start_s)
         reference, velocity = (x, v) if reference_now is None else reference_now
         begin_s = 0.0
@@ -178,8 +178,6 @@ class Motion:
             reference, begin_s = waypoint.q, waypoint.time_s
             velocity = np.zeros_like(x) if waypoint.velocity is None else waypoint.velocity
         self._responses.append(_Response.of(start_s + begin_s, reference[None], x, v))
-        # The past is read back for seconds at most; memory stays bounded over hours of collection.
-        del self._responses[:-16]
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad) and velocities (rad/s) at world time t, each (k,).

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from builtin_interfaces.msg import Time
+from builtin_interfaces.msg import Duration, Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from hostile.arm import Command, HostileArm
@@ -217,8 +217,14 @@ class Bench(BridgeProcess):
         """Whether the planner's newest state at a time was running."""
         return [state for t, state in self.running_since if t <= time_s][-1] == 'running'
 
-    def send(self, solutions: Sequence[FloatArray]) -> str:
-        """Publish a pose with these solutions; returns its stamp as the events name it."""
+    def send(
+        self, solutions: Sequence[FloatArray], curve: tuple[FloatArray, FloatArray] | None = None
+    ) -> str:
+        """Publish a pose with these solutions; returns its stamp as the events name it.
+
+        ``curve``: by which the arm goes to the first solution: where it begins and what it goes
+        through, rad, (n, k), and their shares, (n,); None for the straight way.
+        """
         stamp = self._stamp(0.0)
         message = JointTrajectory(joint_names=self.names)
         message.header.stamp = stamp
@@ -226,9 +232,18 @@ class Bench(BridgeProcess):
         pose = PoseStamped()
         pose.header.stamp = stamp
         pose.header.frame_id = 'base_link'
-        # No way around anything: the straight one to each solution.
+        # No way around anything: the straight one to each solution, or a curve.
         ways = JointTrajectory(joint_names=self.names)
         ways.header.stamp = stamp
+        if curve is not None:
+            # As the planner's: the solution, and one and the share in parts of 1e9 - 2.
+            ways.points = [
+                JointTrajectoryPoint(
+                    positions=list(map(float, q)),
+                    time_from_start=Duration(sec=1, nanosec=1 + round(share * 999_999_998)),
+                )
+                for q, share in zip(*curve, strict=True)
+            ]
         self._waypoints.publish(ways)
         self._poses.publish(pose)
         self._solutions.publish(message)

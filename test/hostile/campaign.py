@@ -72,9 +72,10 @@ from hostile.injections import (
 from hostile.judge import GRACE_S, Body, Judge, Rules, after
 from hostile.lines import EMERGENCY
 from hostile.outcomes import Outcome
-from hostile.scene import HOME, Scene, begin, bench_of, demo_body, target
+from hostile.scene import HOME, Scene, begin, bench_of, curve_to, demo_body, target
 
 from remaster_ros.collection.events import SolutionFailed
+from remaster_ros.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -137,6 +138,8 @@ HALT_WITHIN_S = 4.0
 BEGUN_S = 4.0
 """A bridge has been up for so long before a collection is begun, s: it may hear the planner 2 s
 late here, and takes a run of which it hears within `interlocks.KNOWN_S` of that for an old one."""
+CURVE_S = 4.0
+"""Something happens within so much of a curve, of which each takes longer, s."""
 ANEW = 0.8
 """How often a bridge is started again after a halt, in place of a slow probe of half a minute."""
 
@@ -158,6 +161,8 @@ class Campaign:
         Kinds to draw from; all of them by default.
     per_process
         Injections in the life of a bridge (it is also restarted where an injection kills it).
+    curves
+        Whether the arm moves on curves, by a controller that keeps stamps.
     """
 
     def __init__(
@@ -169,10 +174,12 @@ class Campaign:
         rules: Rules,
         injections: Iterable[Injection] = (),
         per_process: int = 20,
+        curves: bool = False,
     ) -> None:
         self.seed, self.domain, self.folder = seed, domain, folder
         self.body, self.rules = body, rules
         self.injections, self.per_process = tuple(injections), per_process
+        self.curves = curves
         self.rng = np.random.default_rng(seed)
         self.outcomes: list[Outcome] = []
         self._bench: Bench | None = None
@@ -228,12 +235,13 @@ class Campaign:
             np.random.default_rng(rng.integers(2**32)),
             self.rules,
             rate=float(rng.choice([50.0, 100.0, 250.0])),
-            clock_s=float(rng.choice([0.0, 0.0, 37.2, -12.5])),
+            # By the stamps of another clock no curve is gone.
+            clock_s=float(rng.choice([0.0, 0.0, 37.2, -12.5])) * (not self.curves),
             stamp_noise_s=float(rng.choice([0.0, 0.0, 2e-4])),
             exact=bool(rng.random() < 0.3),
             open_loop=bool(rng.random() < 0.3),
             # A controller that keeps the stamps of trajectories, or one that begins at once.
-            keeps_stamps=(kept := bool(rng.random() < 0.5)),
+            keeps_stamps=(kept := bool(self.curves or rng.random() < 0.5)),
             trajectory_stamps='kept' if kept else 'ignored',
             **({'emergency_stop_topic': EMERGENCY} if topic else {}),
         )
@@ -249,22 +257,20 @@ class Campaign:
         begun = [began]
         bench.gap()
         bench.up_for(BEGUN_S)
-        goals = [target(self.body, bench.arm.q, rng)]
-        outcome.moved = begin(bench, goals)
+        goals, outcome.moved = self._begin(bench)
         if not outcome.moved and self._recover(bench):
             # What the last injection left behind may halt the bridge after everything was made
             # right again, and a bridge that has just been started may ask for another
             # /remaster/collect. A person does both.
             bench.up_for(BEGUN_S)
             begun.append(time.monotonic())
-            goals = [target(self.body, bench.arm.q, rng)]
-            outcome.moved = begin(bench, goals)
+            goals, outcome.moved = self._begin(bench)
         settled = len(bench.seen.settled)
         newest = bench.commands_since(began)
         left = max(newest[-1].end_s - time.monotonic(), 0.0) if newest else 0.0
         scene = Scene(bench, self.body, rng, goals, left)
         if outcome.moved:
-            scene.left_s -= scene.wait(0.0, 0.55 * left)
+            scene.left_s -= scene.wait(0.0, CURVE_S if self.curves else 0.55 * left)
             self._act(kind, scene, outcome, settled)
         else:
             # Why not, in the bridge's own words.
@@ -291,6 +297,14 @@ class Campaign:
                 for command in after(bench.commands_since(began), since, until)
             ]
         return outcome
+
+    def _begin(self, bench: Bench) -> tuple[list[FloatArray], bool]:
+        """Send the arm to a random goal; the solutions that were sent, and whether it moves."""
+        if not self.curves:
+            goals = [target(self.body, bench.arm.q, self.rng)]
+            return goals, begin(bench, goals)
+        goal, curve = curve_to(self.body, bench.arm.q, self.rng)
+        return [goal], begin(bench, [goal], curve=curve)
 
     def _act(self, kind: Injection, scene: Scene, outcome: Outcome, settled: int) -> None:
         bench, since = scene.bench, time.monotonic()
@@ -363,9 +377,9 @@ def _take_domain(domains: Queue[int]) -> None:
     _domain = domains.get()
 
 
-def _chunk(work: tuple[int, int, Path, Rules, float]) -> tuple[list[Outcome], str]:
-    seed, count, folder, rules, deadline_s = work
-    campaign = Campaign(seed, _domain, folder, demo_body(), rules)
+def _chunk(work: tuple[int, int, Path, Rules, float, bool]) -> tuple[list[Outcome], str]:
+    seed, count, folder, rules, deadline_s, curves = work
+    campaign = Campaign(seed, _domain, folder, demo_body(), rules, curves=curves)
     try:
         return campaign.run(count, deadline_s), ''
     except Exception as error:  # A bridge that never starts must not end the others' work.
@@ -380,6 +394,7 @@ def in_parallel(
     domains: Iterable[int],
     deadline_s: float = np.inf,
     chunk: int = 20,
+    curves: bool = False,
 ) -> Iterator[tuple[list[Outcome], str]]:
     """Make `count` injections with one process per DDS domain; yields outcomes as they come.
 
@@ -393,6 +408,6 @@ def in_parallel(
         queue.put(domain)
     sizes = [min(chunk, count - first) for first in range(0, count, chunk)]
     seeds = np.random.SeedSequence(seed).generate_state(len(sizes))
-    work = [(int(s), n, folder, rules, deadline_s) for s, n in zip(seeds, sizes)]
+    work = [(int(s), n, folder, rules, deadline_s, curves) for s, n in zip(seeds, sizes)]
     with context.Pool(len(domains), _take_domain, (queue,)) as pool:
         yield from pool.imap_unordered(_chunk, work)

@@ -13,6 +13,7 @@ from hostile.bench import Bench
 from hostile.judge import Body, Rules
 from hostile.process import environment
 
+from remaster_ros.motion.spline import Spline
 from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
@@ -75,12 +76,35 @@ def bench_of(
     )
 
 
-def begin(bench: Bench, solutions: Sequence[FloatArray], timeout_s: float = 15.0) -> bool:
+def curve_to(
+    body: Body, start: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, tuple[FloatArray, FloatArray]]:
+    """Draw a curve that is clear: its end, rad, (k,), and begin and places with their shares."""
+    for _ in range(500):
+        count = int(rng.integers(4, 7))
+        steps = rng.uniform(0.15, 0.5) * SPREAD * rng.uniform(-1.0, 1.0, (count, len(HOME)))
+        places = np.vstack([start, start + np.cumsum(steps, axis=0)])
+        shares = np.append(0.0, np.cumsum(rng.uniform(0.7, 1.3, count)))
+        shares /= shares[-1]
+        way = Spline.through(places, shares).at(np.linspace(0.0, 1.0, 40))
+        inside = np.all((way > 0.9 * body.lower) & (way < 0.9 * body.upper))
+        near = np.all(np.abs(way - HOME) <= 1.2 * SPREAD)
+        if inside and near and all(map(body.clear, way)):
+            return places[-1], (places[:-1], shares[:-1])
+    raise ValueError(f'no curve is clear from {start}')
+
+
+def begin(
+    bench: Bench,
+    solutions: Sequence[FloatArray],
+    timeout_s: float = 15.0,
+    curve: tuple[FloatArray, FloatArray] | None = None,
+) -> bool:
     """Let the planner run and send a pose; returns whether the arm moves in time."""
     if bench.planner != 'running':
         bench.plan_state('running')
     since = time.monotonic()
-    bench.send(solutions)
+    bench.send(solutions, curve)
 
     def waited():
         # A slow probe comes first where it is not sure that the arm is where it is reported.

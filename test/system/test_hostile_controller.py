@@ -43,11 +43,13 @@ def test_a_situation_in_which_the_first_bridge_commanded_what_must_not_be(name, 
 
 
 @pytest.mark.qualify
-@pytest.mark.timeout(900 + 4 * INJECTIONS)
-def test_random_injections(tmp_path):
+@pytest.mark.timeout(900 + 8 * INJECTIONS)
+@pytest.mark.parametrize('curves', [False, True], ids=['lines', 'curves'])
+def test_random_injections(tmp_path, curves):
     """HOSTILE_SEED=n draws others; the moments are never the same."""
     outcomes, broken = [], []
-    for some, error in in_parallel(SEED, INJECTIONS, tmp_path, RULES, DOMAINS, chunk=10):
+    campaign = in_parallel(SEED, INJECTIONS, tmp_path, RULES, DOMAINS, chunk=10, curves=curves)
+    for some, error in campaign:
         outcomes += some
         broken += [error] if error else []
     print(f'seed {SEED}')

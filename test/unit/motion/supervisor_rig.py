@@ -24,7 +24,9 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
+from remaster_ros.motion.path_search import BEGINS_RAD
 from remaster_ros.motion.settling import SettleRules
+from remaster_ros.motion.spline import Spline
 from remaster_ros.motion.states import Arm
 from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.simulation import arm_motion as servo
@@ -93,6 +95,8 @@ class Rig:
 
     @staticmethod
     def _free(request):
+        if len(request.shares):
+            return PathAnswer(curved(request))
         points = np.vstack([request.start, request.waypoints, request.target])
         return PathAnswer(FreePath(points))
 
@@ -213,10 +217,10 @@ class Rig:
         self.state = 'paused'
         self.do(self.supervisor.planner_is('paused', self.wall))
 
-    def plan(self, *solutions, waypoints=None):
+    def plan(self, *solutions, waypoints=None, shares=None):
         targets = np.reshape(np.array(solutions, float), (-1, 2)) * self.unit
         between = {number: way * self.unit for number, way in (waypoints or {}).items()}
-        self.do(self.supervisor.plan(targets, self.wall, between))
+        self.do(self.supervisor.plan(targets, self.wall, between, shares=shares or {}))
 
     def said(self, *kinds):
         return [action for _, action in self.actions if isinstance(action, kinds)]
@@ -257,6 +261,19 @@ class Rig:
         self.run(1.0)
         self.state = 'running'
         self.run(1.0)
+
+
+def curved(request):
+    """Return the path of a request with shares, as the bridge's path search makes it."""
+    if np.max(np.abs(request.start - request.waypoints[0])) > BEGINS_RAD:
+        return FreePath(np.array([request.start, request.target]))
+    points = np.vstack([request.start, request.waypoints[1:], request.target])
+    return along(Spline.through(points, np.append(request.shares, 1.0)))
+
+
+def along(spline):
+    """Return a spline as a path that was found free."""
+    return FreePath(spline.samples[1], curve=spline)
 
 
 @cache

@@ -133,3 +133,45 @@ def test_an_arm_that_is_too_deep_in_is_offered_none(scene):
     answer = ask(search, ARM, ARM)
     assert (answer.path, answer.at_start, answer.way_out) == (None, True, None)
     assert 'block' in answer.why
+
+
+def on_curve(search, start, through, target):
+    """Ask for the curve that begins at the first of the configurations to go through."""
+    shares = np.linspace(0.0, 1.0, len(through) + 1)[:-1]
+    return search.find(CheckPath(7, start, target, np.array(through), shares))
+
+
+THROUGH = [turned(0.0), turned(0.3, 0.8), turned(0.5), turned(0.2, 0.7), turned(-0.2)]
+
+
+def test_a_free_curve_is_the_path(scene):
+    _, speeds, search = scene('nothing')
+    # The servo has left it a little off.
+    start = turned(0.0) + 1e-3
+    path = on_curve(search, start, THROUGH, turned(-0.1, 0.8)).path
+    curve = path.curve
+    assert curve is not None
+    np.testing.assert_array_equal(path.points[[0, -1]], [start, turned(-0.1, 0.8)])
+    np.testing.assert_allclose(curve.at(curve.knots[2:-2]), THROUGH[1:], atol=1e-12)
+    shares = np.linspace(0.0, 1.0, 2000)
+    fastest = speeds.fastest(curve.at(shares), curve.at(shares, 1))
+    assert path.peaks_m == pytest.approx((np.max(fastest),), rel=5e-3)
+
+
+def test_a_curve_through_an_obstacle_or_too_near_to_it_is_not_gone(scene):
+    model, _, search = scene('post')
+    start, target = turned(-0.9), turned(0.9)
+    path = on_curve(search, start, [start, turned(-0.4), turned(0.4)], target).path
+    assert path.curve is None
+    assert model.path_trouble(path.points) == ''
+    np.testing.assert_array_equal(path.points[[0, -1]], [start, target])
+    # Between the samples a body may be so far beside the chords, which counts as clearance.
+    assert search.beside_m == model.travel(np.zeros(7), np.full(7, 2e-4)) > 0.0
+
+
+def test_an_arm_that_stands_elsewhere_goes_straight(scene):
+    _, _, search = scene('nothing')
+    start = turned(0.1)
+    path = on_curve(search, start, THROUGH, turned(-0.1)).path
+    assert path.curve is None
+    np.testing.assert_array_equal(path.points, [start, turned(-0.1)])

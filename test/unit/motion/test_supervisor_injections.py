@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whatever happens: nothing is commanded outside limits, speeds, accelerations; none after a halt.
 
-320 runs of six seconds with one to four injections each, at random moments, of whole moves and of
-moves in pieces. Each command is judged as two kinds of controller would carry it out: from where
-the arm really is and moves (closed loop), and from the reference of the command before (open
-loop). A piece with a stamp is one function of time with the piece before it, for both.
+320 runs of six seconds with one to four injections each, at random moments, of whole moves, of
+moves in pieces, and of curves. Each command is judged as two kinds of controller would carry it
+out: from where the arm really is and moves (closed loop), and from the reference of the command
+before (open loop). A piece with a stamp is one function of time with the piece before it, for
+both.
 """
 
 import copy
@@ -166,19 +167,32 @@ def injections(rng):
 
 @pytest.mark.parametrize('runs', [100, pytest.param(320, marks=pytest.mark.qualify)])
 @pytest.mark.parametrize(
-    'pieces',
-    [{}, {'horizon_s': HORIZON_S}, {'horizon_s': HORIZON_S, 'keeps_stamps': False}],
-    ids=['whole', 'stamps', 'none'],
+    ('pieces', 'curves'),
+    [
+        ({}, False),
+        ({'horizon_s': HORIZON_S}, False),
+        ({'horizon_s': HORIZON_S, 'keeps_stamps': False}, False),
+        ({'horizon_s': HORIZON_S}, True),
+    ],
+    ids=['whole', 'stamps', 'none', 'curves'],
 )
-def test_nothing_dangerous_is_commanded_in_random_runs(pieces, runs):
+def test_nothing_dangerous_is_commanded_in_random_runs(pieces, curves, runs):
     rng = np.random.default_rng(2026)
     begun, counts, worst = Judged(dataclasses.replace(RULES, **pieces)), Counter(), Counter()
     for _ in range(runs):
         rig = copy.deepcopy(begun)
         rig.rng = np.random.default_rng(rng.integers(2**32))
         rig.obey, rig.alter = (lambda waypoints: waypoints), (lambda t, q: q)
-        corners = {0: rng.uniform(LIMITS.lower, LIMITS.upper, (rng.integers(0, 3), 2))}
-        rig.plan(*rng.uniform(LIMITS.lower, LIMITS.upper, (2, 2)), waypoints=corners)
+        if curves:
+            # From where it stands; a spline goes beyond what it goes through.
+            via = rng.uniform(0.6 * LIMITS.lower, 0.6 * LIMITS.upper, (rng.integers(2, 7), 2))
+            steps = np.cumsum(rng.uniform(0.5, 1.5, len(via)))
+            shares = {0: np.append(0.0, steps[:-1] / steps[-1])}
+            corners = {0: np.vstack([rig.arm.at(rig.t)[0], via[:-1]])}
+            rig.plan(via[-1], waypoints=corners, shares=shares)
+        else:
+            corners = {0: rng.uniform(LIMITS.lower, LIMITS.upper, (rng.integers(0, 3), 2))}
+            rig.plan(*rng.uniform(LIMITS.lower, LIMITS.upper, (2, 2)), waypoints=corners)
         events = []
         for _ in range(rng.integers(1, 5)):
             name, begin, end = injections(rng)
@@ -206,12 +220,14 @@ def test_nothing_dangerous_is_commanded_in_random_runs(pieces, runs):
                 rig.told_state = 'paused'
                 counts['cleared'] += 1
         counts['moves'] += len(rig.said(Drive))
+        counts['curves'] += any(d.admitted.trajectory.is_curve for d in rig.said(Drive))
         counts['stops'] += len(rig.said(Stop))
         counts['halted'] += bool(rig.said(Halted))
         for name, value in rig.worst.items():
             worst[name] = max(worst.get(name, -9.0), value)
     # Enough happened for this to mean anything.
     assert counts['moves'] > runs
+    assert (counts.pop('curves') > runs / 2) is curves
     assert counts['stops'] > runs / 8
     assert 0.3 < counts['halted'] / runs < 0.9
     assert min(counts[name] for name in counts if name) > runs / 60

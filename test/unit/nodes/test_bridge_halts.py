@@ -436,7 +436,7 @@ def test_every_rule_is_asked_at_the_time_it_is(rig):
     begin = names.index('rivals')
     assert names[begin:][:5] == ['rivals', 'model', 'controller', 'clock', 'safety_link']
     assert {args[2] for args in seen['observe']} == {r.wall}
-    assert seen['plan'][0][1:] == (r.wall, {}, {})
+    assert seen['plan'][0][1:] == (r.wall, {}, {}, {})
     assert seen['doubt'][0][1] == r.wall
     assert seen['other_joints'][0][1] == r.wall
     (report,) = seen['report'][0]

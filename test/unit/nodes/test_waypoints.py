@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Waypoints on their own topic: grouped again by the solution that they lead to."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,11 @@ from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
 from remaster_ros.errors import InputError
-from remaster_ros.nodes.messages import waypoints_by_solution, waypoints_message
+from remaster_ros.nodes.messages import (
+    curves_by_solution,
+    waypoints_by_solution,
+    waypoints_message,
+)
 from remaster_ros.planning.tour_order import PoseVisit
 
 NAMES = ('a', 'b', 'c')
@@ -55,3 +61,42 @@ def test_what_is_wrong_is_refused(change, message):
     change(sent)
     with pytest.raises(InputError, match=message):
         waypoints_by_solution(sent, NAMES)
+
+
+SHARES = np.array([0.0, 1.0 / 3.0, 0.9])
+
+
+def curved():
+    """Return a visit whose second solution is reached by a curve, and the fourth by lines."""
+    none = np.empty(0)
+    return dataclasses.replace(stop_with(0, 3, 0, 2), shares=(none, SHARES, none, none))
+
+
+def test_the_shares_of_a_curve_come_with_its_waypoints():
+    message = waypoints_message(curved(), NAMES, Header())
+    found = curves_by_solution(message)
+    assert list(found) == [1]
+    np.testing.assert_allclose(found[1], SHARES, atol=1e-9)
+    assert found[1][0] == 0.0
+    paths = waypoints_by_solution(message, NAMES)
+    np.testing.assert_array_equal(paths[1], curved().paths[1])
+    np.testing.assert_array_equal(paths[3], curved().paths[3])
+    assert curves_by_solution(waypoints_message(stop_with(2, 1), NAMES, Header())) == {}
+
+
+@pytest.mark.parametrize(
+    'marks', [(0, 5, 9), (2, 5, 9), (1, 5, 5), (1, 9, 5), (1, 5, 999_999_999)]
+)
+def test_shares_that_do_not_ascend_from_nothing_to_the_end_are_refused(marks):
+    message = waypoints_message(curved(), NAMES, Header())
+    for point, mark in zip(message.points, marks):
+        point.time_from_start.nanosec = mark
+    with pytest.raises(InputError, match='the curve to solution 1'):
+        curves_by_solution(message)
+
+
+def test_a_curve_of_one_point_is_refused():
+    message = waypoints_message(stop_with(1), NAMES, Header())
+    message.points[0].time_from_start.nanosec = 1
+    with pytest.raises(InputError, match='two points and more'):
+        curves_by_solution(message)

@@ -13,6 +13,7 @@ from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.motion.joint_units import TURNING, JointUnits
 from remaster_ros.planning.candidates import (
+    CurvedWay,
     Plan,
     PlannedPose,
     PoseRanges,
@@ -352,3 +353,17 @@ def test_what_cannot_be_reached_in_a_given_order_is_not_tried_again():
     stop = tour.next(np.array([-0.1]))
     assert (sorted(stop.ids), list(stop.unreached)) == ([0, 2], [1])
     assert tour.next(np.array([-0.3])) is None
+
+
+def test_a_pose_with_a_curve_is_reached_by_it_from_where_it_begins():
+    q = random_joints(1, 5)
+    way = CurvedWay(q[:3], np.array([0.0, 0.3, 0.6]))
+    poses = [PlannedPose(CHAIN.forward(q[3]), q[3][None], way=way)]
+    tour = Tour(CHAIN, {'optimization': Plan(tuple(poses))})
+    visit = tour.next(q[0] + 1e-3)
+    np.testing.assert_array_equal(visit.paths[0], q[:3])
+    np.testing.assert_array_equal(visit.shares[0], way.shares)
+    # The rest of it, from elsewhere: any free path will do.
+    again = tour.reroute(visit, q[4])
+    assert (len(again.paths[0]), again.shares) == (0, ())
+    assert tour.with_route(visit, visit.ids).shares == ()

@@ -70,4 +70,13 @@ def test_memory_is_bounded():
     motion = Motion(0.0, np.zeros(1))
     for i in range(1000):
         go(motion, float(i), [i % 2], 0.5)
-    assert len(motion._responses) <= 16
+    # The past, and the way to the last point and its rest.
+    assert len(motion._responses) <= 16 + 2
+
+
+def test_a_trajectory_of_many_points_is_followed_from_its_first():
+    """A stop along a curve has more points than are kept of the past."""
+    motion, times = Motion(0.0, np.zeros(1)), np.arange(1, 61) / 30.0
+    points = [ServoPoint(t, np.array([t]), np.ones(1)) for t in times[:-1]]
+    motion.follow(0.0, [*points, ServoPoint(times[-1], np.array([times[-1]]), np.zeros(1))])
+    assert motion.at(0.5)[0][0] == pytest.approx(0.5 - 2 * DAMPING / NATURAL_FREQUENCY, abs=0.01)
