@@ -54,6 +54,8 @@ MEAN_LAG_STD_S = 1e-6
 WINDUP_STD_RAD = 5e-4
 # Gearboxes of 3 kN m/rad and stiffer, rad/(N m).
 SOFTNESS_STD = 3e-4
+# Below this std a delay is shown to a microsecond, s.
+SHOWN_S = 5e-6
 # Fewest frames of a sensor that show correlations.
 FEWEST_FRAMES = 40
 # A tool's mode of 7 Hz and above, s².
@@ -71,17 +73,21 @@ class MotionColumns:
     velocity: FloatArray  # rad/s
     acceleration: FloatArray  # rad/s²
     seconds: FloatArray  # Times of the rows, s, (n,)
+    turned: FloatArray  # Where each joint of an arm that has come to rest turned last, (n, k)
 
     @classmethod
     def of(cls, chain: SerialChain, m: Measurements, offsets: FloatArray) -> MotionColumns:
         """Functions of the motion of n measurements with velocities; NaN rates count as 0.
 
-        ``offsets``: zero-offsets added to the joints, rad or m, (k,).
+        Velocities of 0 are of an arm that has come to rest, whose ``from_q`` is where each joint
+        turned last. ``offsets``: zero-offsets added to the joints, rad or m, (k,).
         """
         assert m.velocity is not None
         assert m.acceleration is not None
         rates = np.nan_to_num(m.velocity), np.nan_to_num(m.acceleration)
-        return cls(chain, m.q + offsets, *rates, m.stamp_s)
+        at_rest = ~np.any(m.velocity != 0.0, axis=1)
+        turned = np.where(at_rest[:, None], m.from_q, np.nan)
+        return cls(chain, m.q + offsets, *rates, m.stamp_s, turned + offsets)
 
     def at(self, rows: IntArray) -> MotionColumns:
         """Functions of some rows, by their indices; friction is that of the path of all rows."""
@@ -91,6 +97,7 @@ class MotionColumns:
             self.velocity[rows],
             self.acceleration[rows],
             self.seconds[rows],
+            self.turned[rows],
             self,
             rows,
         )
@@ -115,7 +122,9 @@ class MotionColumns:
         (`TRAVELS_RAD`, times ``per_radian``).
         """
         soon, late = (
-            friction_share(self.seconds, self.q, self.velocity, self.acceleration, travel)
+            friction_share(
+                self.seconds, self.q, self.velocity, self.acceleration, travel, self.turned
+            )
             for travel in (np.outer(TRAVELS_RAD, self.chain.per_radian))
         )
         return soon, late - soon
@@ -158,12 +167,14 @@ def friction_share(
     velocity: FloatArray,
     acceleration: FloatArray,
     travel: FloatArray,
+    turned: FloatArray | None = None,
 ) -> FloatArray:
     """Share of its full torque that friction has, the mean over each row, (n, k).
 
     After each reversal friction reverses within a travel, (k,), of the joint: in Dahl's model
     (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed exponentially. It
-    is followed along neighbouring rows, and begins at that sign.
+    is followed along neighbouring rows, and begins at that sign. An arm at rest keeps the share
+    that it has come with since its joints ``turned``, (n, k); where that is NaN it is 0.
     """
     moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
     q, velocity, acceleration = q[first], velocity[first], acceleration[first]
@@ -185,7 +196,12 @@ def friction_share(
             total += share
             last = place
         shares[i] = total / PARTS
-    shares[~np.any(velocity != 0.0, axis=1)] = 0.0
+    still = ~np.any(velocity != 0.0, axis=1)
+    shares[still] = 0.0
+    if turned is not None:
+        way = q - turned[first]
+        at_rest = np.sign(way) * (1.0 - 2.0 * np.exp(-np.abs(way) / travel))
+        shares[still] = np.nan_to_num(at_rest[still])
     return shares[which.reshape(-1)]
 
 
@@ -333,6 +349,28 @@ def moving_words(found: Estimate) -> str:
     return f'the moving robot fits to {length:.2f} mm (median); {"; ".join(clocks)}'
 
 
+def friction_at_rest(found: Estimate) -> FloatArray:
+    """Variance of each row's marker by the friction of a resting arm, m² of its length, (n,).
+
+    How friction turns round within its travel is known to the two travels of the model alone: the
+    std of a joint's share is taken for half of the difference of both. 0 in motion, and without
+    parameters of motion.
+    """
+    m, extension, model = found.problem.measurements, found.model.extension, found.model
+    variance = np.zeros(len(m))
+    if extension is None or not extension.of_motion or m.velocity is None:
+        return variance
+    columns = MotionColumns.of(found.problem.chain, m, np.zeros(m.q.shape[1]))
+    at_rest = np.all(m.velocity == 0.0, axis=1)
+    names, theta = list(extension.names), model.theta(found.mode.z)
+    windup = np.array([theta[names.index(f'windup_{j + 1}')] for j in range(m.q.shape[1])])
+    off = 0.5 * columns.friction[1][at_rest] * windup
+    markers = found.problem.markers[m.marker[at_rest]]
+    jacobian = found.problem.chain.position_jacobian(m.q[at_rest], markers)
+    variance[at_rest] = np.einsum('nik,nk->n', jacobian**2, off**2)
+    return variance
+
+
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
     """Delay of stamps to those of the joints, and its standard deviation, s, by sensor.
 
@@ -360,4 +398,5 @@ def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
 def late_words(late_s: float, std_s: float) -> str:
     """Delay and its std as text in ms: '9.97 ± 0.12 ms late'; 'early' if negative."""
     what = 'late' if late_s >= 0.0 else 'early'
-    return f'{1e3 * abs(late_s):.2f} ± {1e3 * std_s:.2f} ms {what}'
+    digits = 2 if std_s >= SHOWN_S else 3
+    return f'{1e3 * abs(late_s):.{digits}f} ± {1e3 * std_s:.{digits}f} ms {what}'

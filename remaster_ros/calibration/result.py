@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,14 @@ from scipy.linalg import cho_factor, cho_solve
 
 from remaster_ros.calibration.comparison import Comparison, compared, predicted_rows
 from remaster_ros.calibration.convergence import Diagnostics, SamplerInfo
-from remaster_ros.calibration.dynamics import clocks_of
+from remaster_ros.calibration.dynamics import clocks_of, friction_at_rest
 from remaster_ros.calibration.estimate import Estimate, Problem
 from remaster_ros.calibration.gauge_words import the
 from remaster_ros.calibration.identifiability import Gauge, GaugeDirection, known_offsets
 from remaster_ros.calibration.laplace import Mode
 from remaster_ros.calibration.left_out import held_out_tests
 from remaster_ros.calibration.metropolis import Chains
+from remaster_ros.calibration.motion_proof import MotionProof, motion_proof
 from remaster_ros.calibration.noise_check import NoiseCheck, check_noise
 from remaster_ros.calibration.noise_estimate import NoiseEstimate, noise_estimates
 from remaster_ros.calibration.orientation_accuracy import (
@@ -306,6 +307,18 @@ class FitResult:
     def clocks(self) -> Mapping[str, tuple[float, float]]:
         """Delay of each sensor's stamps to the joints', and its std, s; {} if none moved."""
         return {} if self.found is None else clocks_of(self.found)
+
+    @cached_property
+    def motion_proof(self) -> MotionProof | None:
+        """Held-out errors at standstill beside those in motion; None if they do not tell."""
+        m = self.session.measurements
+        if m.velocity is None:
+            return None
+        markers = np.array(list(self.session.markers.values()))[m.marker]
+        jacobian = self.chain.position_jacobian(m.q, markers)
+        speeds = np.einsum('nik,nk->ni', jacobian, np.nan_to_num(m.velocity))
+        friction = np.zeros(len(m)) if self.found is None else friction_at_rest(self.found)
+        return motion_proof(m, self.residuals_after, np.linalg.norm(speeds, axis=1), friction)
 
     @property
     def T_R_N_before(self) -> Mapping[str, FloatArray]:

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from remaster_ros.calibration.dynamics import estimate_moving, moving_words
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.cli.console import progress_bar, show, tell
 from remaster_ros.cli.options import add_description, names, number, xacro_arguments
@@ -27,7 +28,7 @@ from remaster_ros.importing.assemble import (
 )
 from remaster_ros.importing.bags import is_bag, read_bag, read_streams
 from remaster_ros.importing.columns import ColumnChoice
-from remaster_ros.importing.moving import MovingOptions, moving_session
+from remaster_ros.importing.moving import MovingOptions, moving_session, with_proof
 from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.sessions import Stretch, arrangement_of, corrected_session
@@ -80,6 +81,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--moving',
         action='store_true',
         help='of a bag: rows of 0.1 s while the arm moves, in place of its standstills',
+    )
+    parser.add_argument(
+        '--proof',
+        metavar='SESSION',
+        type=Path,
+        help='with --moving: its held-out poses at standstill are held-out rows as well, by which '
+        'the model of the motion is proved; measured by the same sensors, which stand where they '
+        'stood',
     )
     table = parser.add_argument_group('what the columns are, where it was not found')
     table.add_argument(
@@ -486,6 +495,11 @@ def _import_moving(
         rng = np.random.default_rng(args.seed)
         session, how = moving_session(str(path), joints, streams, chain, urdf, options, rng)
         session, turned = without_whole_turns(session, chain)
+        if args.proof is not None:
+            moving_poses = len(np.unique(session.measurements.pose))
+            session = with_proof(session, joints, str(args.proof), read_session(args.proof))
+            poses = len(np.unique(session.measurements.pose)) - moving_poses
+            how.append(f'{counted(poses, "pose")} at standstill of {args.proof}, held out')
         fits = ''
         if not args.unchecked:
             progress('trying', 0.8)

@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from remaster_ros.calibration.dynamics import ROW_S
+from remaster_ros.calibration.dynamics import ROW_S, TRAVELS_RAD
 from remaster_ros.calibration.estimate import Problem
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.grouped_rows import Rows
@@ -38,6 +38,7 @@ from remaster_ros.importing.joint_motion import JointMotion
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse
+from remaster_ros.session.observations import stacked
 from remaster_ros.types import (
     AccuracyOption,
     BoolArray,
@@ -76,6 +77,13 @@ AT_A_RATE = 0.99
 LONGEST_CLOCK_STEP_S = 0.05
 # Largest number of rows of a robust fit for the clocks.
 MOST_FITTED = 1_500
+# The way of an arm before it rests is followed for so much time, in such steps, s. A joint whose
+# spline moves by less than this share of the noise of its reports stands.
+ARRIVAL_S, WAY_STEP_S, STANDS_NOISE = 6.0, 2e-3, 0.5
+# Travel within which friction turns round, rad: between those that every fit has.
+FRICTION_TRAVEL_RAD = float(np.sqrt(np.prod(TRAVELS_RAD)))
+# Largest share that is told from full friction.
+FULL_SHARE = 1.0 - 1e-6
 # Distance of a frame from the others of its row, in robust standard deviations, from which it is
 # of another marker.
 GROSS = 8.0
@@ -465,6 +473,89 @@ def moving_session(
     return session, how
 
 
+def with_proof(session: Session, joints: Stream, name: str, standing: Session) -> Session:
+    """Return a moving session with the held-out standstills of another as held-out rows.
+
+    Their velocities are 0; ``from_q`` is where each joint turned last before it came to rest
+    (`effective_turns`), by which the friction is known that holds it.
+
+    Parameters
+    ----------
+    session
+        Of the arm that moved.
+    joints
+        Joint positions, rad, (n, k), by the stamps of both sessions.
+    name, standing
+        Session whose poses were measured at standstill by the same sensors and markers, none of
+        which was moved in between; its name, for messages.
+
+    Raises
+    ------
+    InputError
+        Another arm, no sensor or marker in common, or no held-out pose.
+    """
+    if standing.urdf_sha256 != session.urdf_sha256 or standing.is_moving:
+        what = 'is itself of a moving arm' if standing.is_moving else 'has another URDF'
+        raise InputError(
+            f'{name} {what}, and proves nothing here: name the session of the standstills, with '
+            'the same arm'
+        )
+    m, s = session.measurements, standing.measurements
+    assert m.frame is not None
+    sensors, markers = list(session.sensors), list(session.markers)
+    of_sensor = [sensors.index(n) if n in sensors else -1 for n in standing.sensors]
+    of_marker = [markers.index(n) if n in markers else -1 for n in standing.markers]
+    sensor, marker = np.array(of_sensor)[s.sensor], np.array(of_marker)[s.marker]
+    kept = np.flatnonzero(s.is_validation & (sensor >= 0) & (marker >= 0))
+    if not len(kept):
+        raise InputError(
+            f'{name} has no held-out pose of {", ".join(sensors)} with the markers '
+            f'{", ".join(markers)}: there is nothing to prove the motion by'
+        )
+    chosen = s.select(kept)
+    rest = np.zeros_like(chosen.q)
+    configurations, index = np.unique(chosen.configuration, return_inverse=True)
+    stamps = np.array([chosen.stamp_s[chosen.configuration == c].min() for c in configurations])
+    turned = effective_turns(JointMotion.of(joints, name), stamps)[index.reshape(-1)]
+    rows = replace(
+        chosen,
+        pose=1 + m.pose.max() + chosen.pose - chosen.pose.min(),
+        configuration=1 + m.configuration.max() + chosen.configuration - s.configuration.min(),
+        sensor=sensor[kept],
+        marker=marker[kept],
+        frame=None if chosen.frame is None else 1 + int(m.frame.max()) + chosen.frame,
+        from_q=turned,
+        velocity=rest,
+        acceleration=rest,
+    )
+    return replace(session, measurements=_in_order(stacked([m, rows])))
+
+
+def effective_turns(motion: JointMotion, stamps: FloatArray) -> FloatArray:
+    """Return where joints at rest at some times would have turned last, rad, (n, k).
+
+    Such that the one turn leaves the friction that the arm's way has left, Dahl's model with the
+    travel `FRICTION_TRAVEL_RAD`: a servo overshoots and goes back by about that. NaN outside the
+    record. ``stamps``: s, (n,).
+    """
+    turns = np.full((len(stamps), len(motion.noise)), np.nan)
+    for row, stamp in enumerate(stamps):
+        way = motion.at(np.append(np.arange(stamp - ARRIVAL_S, stamp, WAY_STEP_S), stamp))
+        way = way[np.isfinite(way[:, 0])]
+        if not len(way):
+            continue
+        share, last = np.zeros(way.shape[1]), way[0].copy()
+        for place in way:
+            step = place - last
+            step[np.abs(step) < STANDS_NOISE * motion.noise] = 0.0
+            last += step
+            side = np.sign(step)
+            share = side + (share - side) * np.exp(-np.abs(step) / FRICTION_TRAVEL_RAD)
+        back = FRICTION_TRAVEL_RAD * np.log(0.5 * (1.0 - np.minimum(np.abs(share), FULL_SHARE)))
+        turns[row] = way[-1] + np.sign(share) * back
+    return turns
+
+
 def _restamped(name: str, frames: _Frames, steady: _Frames) -> str:
     """Sentence on stamps that were replaced; '' if they were not."""
     if steady is frames:
@@ -532,7 +623,11 @@ def _joined(parts: Sequence[Measurements]) -> Measurements:
         else np.concatenate([getattr(part, name) for part in parts])
         for name in vars(parts[0])
     }
-    whole = Measurements(**columns)  # type: ignore[arg-type]
+    return _in_order(Measurements(**columns))  # type: ignore[arg-type]
+
+
+def _in_order(whole: Measurements) -> Measurements:
+    """Rows in the order of time, sensor and marker, numbered from 0."""
     order = np.lexsort((whole.marker, whole.sensor, whole.stamp_s))
     return replace(whole.select(order), observation=np.arange(len(whole)))
 

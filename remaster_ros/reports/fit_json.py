@@ -218,6 +218,8 @@ def fit_content(result: FitResult) -> schemas.Fit:
         content['orientation'] = _orientation(result, result.orientations)
     if result.clocks:
         content['clocks'] = clocks_content(result.clocks)
+    if result.motion_proof is not None:
+        content['motion_proof'] = result.motion_proof
     if (geometry := geometry_of(result)) is not None:
         content['geometry'] = _geometry(result, geometry)
         wider = of_joints(result.chain, **uncertainty(result)._asdict())

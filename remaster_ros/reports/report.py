@@ -56,6 +56,7 @@ from remaster_ros.reports.sentences import (
     as_drawn,
     load_words,
     loadable_of_fit,
+    motion_rows,
     references,
 )
 from remaster_ros.session.files import decode_text, make_folder, read_limited, write_atomically
@@ -262,6 +263,7 @@ def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
         to_load=[(row, *load_words(row)) for row in loadable],
         answer=answer_of(inputs),
         accuracy=accuracy_rows(inputs.fit.accuracy),
+        motion=motion_rows(inputs.fit),
         markers=marker_rows(fit, result.session),
         references=references(result),
         session=result.session,

@@ -17,6 +17,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.convergence import SamplerInfo
 from remaster_ros.calibration.identifiability import GaugeDirection
+from remaster_ros.calibration.motion_proof import MotionProof
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.noise_estimate import NoiseEstimate
 from remaster_ros.calibration.predictions import Coverage
@@ -252,6 +253,7 @@ class Fit(Struct):
     geometry: FittedGeometry | UnsetType = UNSET
     orientation: Orientation | UnsetType = UNSET
     clocks: dict[str, Clock] | UnsetType = UNSET
+    motion_proof: MotionProof | UnsetType = UNSET
     judgement: Judgement | UnsetType = UNSET
 
 

@@ -11,9 +11,10 @@ import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 
 from remaster_ros.calibration.convergence import SamplerInfo
-from remaster_ros.calibration.dynamics import late_words
+from remaster_ros.calibration.dynamics import MODES, late_words
 from remaster_ros.calibration.gauge_words import counted, in_a_line, listed
 from remaster_ros.calibration.measured_again import MeasuredAgain
+from remaster_ros.calibration.motion_proof import MotionProof
 from remaster_ros.calibration.noise_check import SPOILT, NoiseCheck
 from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
@@ -143,6 +144,9 @@ def verdict(result: FitResult) -> Judgement:
             f'take up: measure at least {FEWEST_POSES} and fit again.'
         )
     disagreements = [*result.session.disagreements, *changes, *spoilt, *displaced]
+    proof = result.motion_proof
+    if proof is not None and proof.disagree:
+        disagreements.append(proof.words)
     points = findings + doubts + _widening(result) + disagreements
     doubtful = bool(unexplained or untold) or result.other_errors
     hardly = hardly_proven(_held_out_poses(result.session))
@@ -182,6 +186,8 @@ def verdict(result: FitResult) -> Judgement:
         mood = 'bad'
         headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
         points = [*result.implausible, *points]
+    if proof is not None and not proof.disagree:
+        points.append(proof.words)
     if again.again:
         points.append(again.words)
     if note := result.session.correction_note:
@@ -771,6 +777,47 @@ def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
         'it to what joins their data (import --clock-offset)'
         for name, clock in clocks.items()
     ]
+
+
+def motion_rows(fit: Fit) -> list[tuple[str, str]]:
+    """What a fit of motion says besides the offsets: quantity and value, as text; [] without.
+
+    How late the stamps of each sensor are, lag and wind-up of each joint, the frequency at which
+    the tool swings, and the held-out errors in motion and at standstill.
+    """
+    if not isinstance(fit.clocks, dict) or not isinstance(fit.parameters, list):
+        return []
+    rows = [
+        (f'stamps of {name}', late_words(1e-3 * clock.late_ms, 1e-3 * clock.std_ms))
+        for name, clock in fit.clocks.items()
+    ]
+    effects = {p.name.removeprefix('effect.'): p for p in fit.parameters}
+    for number, joint in enumerate(fit.joint_offsets, start=1):
+        lag, windup = effects.get(f'lag_{number}'), effects.get(f'windup_{number}')
+        if lag is None or windup is None:
+            continue
+        scale = 1e3 if joint.unit == 'mm' else np.degrees(1.0)
+        rows.append(
+            (
+                joint.joint,
+                f'reported {late_words(lag.mean, lag.std)}, beside the mean of all joints; '
+                f'wind-up by friction {scale * abs(windup.mean):.4f} ± {scale * windup.std:.4f} '
+                f'{joint.unit}',
+            )
+        )
+    modes = [effects[name] for name in MODES[:3] if name in effects]
+    swings = [1.0 / (2.0 * np.pi * np.sqrt(m.mean)) for m in modes if m.mean > 3.0 * m.std]
+    if swings:
+        rows.append(('the tool swings at', f'{min(swings):.1f} to {max(swings):.1f} Hz'))
+    if isinstance(proof := fit.motion_proof, MotionProof):
+        rows.append(
+            (
+                f'error in motion, at up to {proof.fastest_mm_s:.0f} mm/s',
+                f'{proof.motion_mm:.3f} mm; at standstill {proof.standstill_mm:.3f} mm (held out, '
+                'mean of the markers)',
+            )
+        )
+    return rows
 
 
 def _offset(row: JointOffset) -> str:

@@ -10,7 +10,7 @@ import pytest
 from worlds.moving_bags import CELL, CHAIN, imported, recorded, standing, write_bag
 from worlds.moving_world import Dynamics, Errors, without_dynamics
 
-from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
+from remaster_ros.calibration.dynamics import TRAVELS_RAD, clocks_of, estimate_moving
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
@@ -18,9 +18,10 @@ from remaster_ros.cli.main import main
 from remaster_ros.errors import InputError
 from remaster_ros.importing import bags
 from remaster_ros.importing.joint_motion import JointMotion
-from remaster_ros.importing.moving import _Frames
+from remaster_ros.importing.moving import _Frames, effective_turns, with_proof
 from remaster_ros.importing.standstills import Stream
-from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.reports.fit_json import fit_content, read_fit
+from remaster_ros.reports.sentences import motion_rows, verdict
 from remaster_ros.session.reader import read_session, write_session
 from remaster_ros.types import Session
 
@@ -181,6 +182,9 @@ def test_fit_has_the_dynamics_and_the_paper_sampler_refuses(session):
     result = fit_session(session, rng=np.random.default_rng(0))
     assert {'clock_bar', 'lag_2', 'windup_3', 'inertia_2', 'tool_mode_x'} <= {*result.theta_names}
     assert result.accuracy['optimization']['relative']['before'] is None
+    rows = dict(motion_rows(fit_content(result)))
+    assert rows['stamps of bar'].endswith(('late', 'early'))
+    assert [what for what in rows if what.startswith('joint_')] == list(CHAIN.joint_names)
     with pytest.raises(InputError, match='no dynamics'):
         fit_session(session, rng=np.random.default_rng(0), sampler='paper')
 
@@ -263,6 +267,89 @@ def test_moving_frames_agree_with_the_standstills_between_them(tmp_path, capsys)
     command = ['discover', str(tmp_path / 'still'), '--out', str(tmp_path / 'd')]
     assert main([*command, '--confirm', str(tmp_path / 'moving')]) == 2
     assert 'was measured while the arm moved' in capsys.readouterr().err
+
+
+@pytest.fixture(scope='module')
+def stopped():
+    """Return a recording with standstills, its rows of motion, and the standstills, held out."""
+    print('moving world, seed 5003')
+    recording = recorded(5003, seconds=7.0, stops=True, joints_hz=125.0, camera_hz=60.0)
+    still = standing(*recording)
+    held_out = np.ones(len(still.measurements), bool)
+    still = replace(still, measurements=replace(still.measurements, is_validation=held_out))
+    return recording, imported(*recording)[0], still
+
+
+def joints_of(recording):
+    return Stream.of(recording[1].joint_stamps, recording[1].joints)
+
+
+def test_standstills_are_held_out_rows_of_a_moving_session(stopped, tmp_path):
+    recording, moving, still = stopped
+    proved = with_proof(moving, joints_of(recording), 'still', still)
+    m, at_rest = proved.measurements, np.all(proved.measurements.velocity == 0.0, axis=1)
+    assert at_rest.sum() == len(still.measurements)
+    assert np.all(m.is_validation[at_rest])
+    assert len(m) == len(moving.measurements) + at_rest.sum()
+    assert not set(m.pose[at_rest]) & set(m.pose[~at_rest])
+    assert np.all(np.diff(m.stamp_s) >= 0.0)
+    np.testing.assert_array_equal(m.observation, np.arange(len(m)))
+    write_session(tmp_path / 'proved', proved)
+    again = read_session(tmp_path / 'proved').measurements
+    np.testing.assert_array_equal(again.velocity, m.velocity)
+    np.testing.assert_allclose(again.from_q, m.from_q, atol=1e-12)
+
+
+@pytest.mark.qualify
+def test_standstills_prove_a_fit_of_motion_or_doubt_it(stopped):
+    recording, moving, still = stopped
+    proved = with_proof(moving, joints_of(recording), 'still', still)
+    result = fit_session(proved, rng=np.random.default_rng(0))
+    assert result.motion_proof.poses == len(np.unique(still.measurements.pose))
+    assert not result.motion_proof.disagree
+    assert result.motion_proof.words in verdict(result).points
+    # A joint that stands half a tenth of a degree elsewhere than it did in motion.
+    other = replace(still, measurements=replace(still.measurements, q=still.measurements.q + 1e-3))
+    doubted = fit_session(
+        with_proof(moving, joints_of(recording), 'still', other), rng=np.random.default_rng(0)
+    )
+    assert doubted.motion_proof.disagree
+    assert doubted.motion_proof.words in verdict(doubted).disagreements
+    assert verdict(doubted).mood == 'caution'
+
+
+def test_only_standstills_of_the_same_arm_and_sensors_prove_anything(stopped):
+    recording, moving, still = stopped
+    joints = joints_of(recording)
+    fitted = replace(still.measurements, is_validation=np.zeros(len(still.measurements), bool))
+    for other, why in (
+        (replace(still, urdf=still.urdf + ' '), 'has another URDF'),
+        (moving, 'is itself of a moving arm'),
+        (replace(still, measurements=fitted), 'no held-out pose of bar'),
+        (replace(still, sensors={'tracker': 'ball_1'}), 'no held-out pose of bar'),
+    ):
+        with pytest.raises(InputError, match=why):
+            with_proof(moving, joints, 'still', other)
+
+
+def test_the_effective_turn_leaves_the_friction_of_the_whole_way():
+    """A servo that overshoots by a tenth of a milliradian, comes back, and rests."""
+    t = np.arange(0.0, 8.0, 0.004)
+    decay = np.exp(-9.8 * np.maximum(t - 3.0, 0.0)) * np.cos(10.0 * np.maximum(t - 3.0, 0.0))
+    q = np.where(t < 3.0, 0.1 * (t - 3.0), 0.0) - np.where(t >= 3.0, 4e-3 * (1.0 - decay), 0.0)
+    q = np.stack((q, -q), axis=1)
+    noise = np.random.default_rng(0).normal(0.0, 1e-6, q.shape)
+    motion = JointMotion.of(Stream.of(t, q + noise), 'x')
+    turned = effective_turns(motion, np.array([7.5, 20.0]))
+    assert np.isnan(turned[1]).all()
+    share, travel = np.zeros(2), float(np.sqrt(np.prod(TRAVELS_RAD)))
+    for step in np.diff(q, axis=0):
+        side = np.sign(step)
+        share = side + (share - side) * np.exp(-np.abs(step) / travel)
+    way = q[-1] - turned[0]
+    found = np.sign(way) * (1.0 - 2.0 * np.exp(-np.abs(way) / travel))
+    assert 0.1 < abs(share[0]) < 0.999
+    np.testing.assert_allclose(found, share, atol=0.05)
 
 
 def test_what_cannot_be_measured_in_motion_is_refused(recording, tmp_path, capsys):
