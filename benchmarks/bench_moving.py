@@ -4,6 +4,7 @@
 Worlds of test/worlds/moving_world.py: pinocchio, with dynamics and an error field of its own. In
 each a recording is imported as of a bag and fitted, with the dynamics and, beside it, without.
 `--fakes` takes what the fakes of `remaster demo --dynamics` say in the place of these worlds.
+`--planned` drives the curves of `remaster plan --moving` in them.
 
     python benchmarks/bench_moving.py --sessions 60 --fakes 40
 """
@@ -22,13 +23,19 @@ import numpy as np
 from worlds.dynamic_fakes import play
 from worlds.moving_bags import imported, recorded, standing
 from worlds.moving_world import Dynamics, Errors
+from worlds.planned_motion import driven
+from worlds.simple_cells import four_markers
 
 from remaster_ros.calibration.dynamics import clocks_of, estimate_moving
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.errors import InsufficientDataError
+from remaster_ros.planning.moving_design import design_moving
+from remaster_ros.planning.moving_information import expected_along
+from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.reports.sentences import verdict
+from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray, Session
 
 COLOURS = {'good': 'green', 'caution': 'amber', 'bad': 'red'}
@@ -178,6 +185,58 @@ def stop_and_go(count: int) -> str:
     )
 
 
+# Errors of the worlds of planned curves. A plan assumes the lengths of the first.
+FIELDS = (
+    Errors(),
+    Errors(reach_m=0.05, reach_rad=0.25),
+    Errors(reach_m=0.2, reach_rad=1.0),
+    Errors(own_field_m=5e-5),
+)
+
+
+def planned(count: int, seconds: float, tool_speed: float) -> Iterator[str]:
+    """Give how fits of planned curves agree with what the plan expects, and with the truth."""
+    with tempfile.TemporaryDirectory() as folder:
+        cell = read_cell(four_markers(Path(folder) / 'cell.yaml'))
+    scene, settings = (
+        cell.planning_scene(cell.chain(), without_meshes=True),
+        cell.design_settings(),
+    )
+    limits = cell.acceleration_limits(scene.model.chain)
+    travel = TravelTime.of(scene.model, 0.3, tool_speed, limits)
+    begun = time.process_time()
+    designs = [
+        design_moving(scene, travel, settings, scene.rough_R, np.random.default_rng(seed), seconds)
+        for seed in range(count)
+    ]
+    cpu = (time.process_time() - begun) / count
+    yield f'{count} plans of {seconds:g} s, at most {tool_speed:g} m/s; CPU of a plan {cpu:.0f} s'
+    for errors in FIELDS:
+        stds, ratios, z = [], [], []
+        for seed, design in enumerate(designs):
+            expected = expected_along(
+                scene.model.chain,
+                design.rows,
+                settings.sensors,
+                settings.marker_std_m,
+                settings.priors,
+                errors.own_field_m,
+            )
+            promised = np.array(list(expected.joint_std.values())[1:-1], float)
+            world, _, session = driven(cell, design.curves, seed, errors)
+            offsets, std = inner(estimate_moving(Problem.of(session)))
+            stds.append(promised)
+            ratios.append(_rms(std) / _rms(promised))
+            z.append((offsets - world.joint_offsets[1:-1]) / std)
+        yield (
+            f'  field of {1e3 * errors.field_m:g} mm over {errors.reach_m:g} m and '
+            f'{errors.reach_rad:g} rad, of each marker {1e3 * errors.own_field_m:g} mm: expected '
+            f'std {np.degrees(_rms(np.array(stds))):.4f}°, stated over expected '
+            f'{np.mean(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}), RMS z '
+            f'{_rms(np.array(z)):.2f}'
+        )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -185,6 +244,7 @@ def main() -> None:
     parser.add_argument('--verdicts', type=int, default=4, help='sessions whose fits are judged')
     parser.add_argument('--stops', type=int, default=0, help='stop-and-go recordings')
     parser.add_argument('--fakes', type=int, default=0, help='sessions of the fakes')
+    parser.add_argument('--planned', type=int, default=0, help='sessions of planned curves')
     args = parser.parse_args()
     print(common.machine())
     each = args.sessions // len(WORLDS)
@@ -212,6 +272,10 @@ def main() -> None:
     for scale in (1.0, 3.0):
         if args.fakes:
             print(of_fakes(args.fakes // 2, scale, 100))
+    for seconds, tool_speed in ((30.0, 0.25), (40.0, 0.25), (60.0, 0.25), (40.0, np.inf)):
+        if args.planned:
+            for line in planned(args.planned, seconds, tool_speed):
+                print(line)
 
 
 if __name__ == '__main__':

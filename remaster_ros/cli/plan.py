@@ -14,16 +14,26 @@ import numpy as np
 from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.options import add_poses, integer, number
 from remaster_ros.compensation.check_visits import CHECK_POSES, chosen_visits
-from remaster_ros.errors import InsufficientDataError
+from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.planning.candidates import PlanningScene
-from remaster_ros.planning.collection_plan import CollectionPlan, plan_collection
+from remaster_ros.planning.collection_plan import (
+    CollectionPlan,
+    plan_collection,
+    session_time_s,
+)
+from remaster_ros.planning.moving_design import (
+    LONGEST_MOVING_S,
+    MOVING_S,
+    SHORTEST_MOVING_S,
+    check_sensors,
+)
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import DWELL_S, SETTLE_S, SPEED_SHARE, TravelTime
 from remaster_ros.reports.found_causes import read_causes
-from remaster_ros.reports.plan_json import plan_text, plan_to_dict
+from remaster_ros.reports.plan_json import minutes_text, plan_text, plan_to_dict
 from remaster_ros.reports.plan_page import check_plan_page, plan_page, write_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
 from remaster_ros.session.files import write_atomically
@@ -90,6 +100,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help='choose the eight configurations of `remaster check` among those planned, and write '
         'their joints as a table, such as check.csv',
+    )
+    parser.add_argument(
+        '--moving',
+        metavar='SECONDS',
+        type=number(SHORTEST_MOVING_S, LONGEST_MOVING_S, 's'),
+        nargs='?',
+        const=MOVING_S,
+        default=0.0,
+        help='measure while the arm moves, along curves of so many seconds in all (default '
+        f'{MOVING_S:g}), with poses at standstill as proof; for a camera that sees four markers',
     )
     parser.add_argument(
         '--json', action='store_true', help='print one JSON object and nothing else'
@@ -188,6 +208,8 @@ def planned(
     `read_causes`.
     """
     travel = _travel(cell, scene, args)
+    if args.moving:
+        _check_moving(cell, scene, args, travel)
     causes = read_causes(args.separate, scene.model.chain.joint_names) if args.separate else ()
     counts = {
         'optimization': args.poses,
@@ -195,10 +217,42 @@ def planned(
         REGISTRATION: REGISTRATION_CANDIDATES,
     }
     planner = TourPlanner(
-        scene, counts, args.seed, args.reference_every, cell.design_settings(), travel, causes
+        scene,
+        counts,
+        args.seed,
+        args.reference_every,
+        cell.design_settings(),
+        travel,
+        causes,
+        args.moving,
     )
     start = free_start(scene.model, args.seed)
     return plan_collection(planner, planner.rough_places, start, progress)
+
+
+def _check_moving(
+    cell: Workcell, scene: PlanningScene, args: argparse.Namespace, travel: TravelTime
+) -> None:
+    """Raise InputError if motion cannot be measured, with the time that stop and go takes."""
+    if args.separate:
+        raise InputError(
+            '--separate adds configurations at standstill, and --moving has none to fit; leave '
+            'one of them out'
+        )
+    try:
+        check_sensors(scene, cell.design_settings().sensors)
+    except InputError as error:
+        counts = {
+            'optimization': args.poses,
+            'validation': args.validation,
+            REGISTRATION: REGISTRATION_CANDIDATES,
+        }
+        planner = TourPlanner(
+            scene, counts, args.seed, args.reference_every, cell.design_settings(), travel
+        )
+        tour = planner.collection(planner.rough_places)
+        seconds = session_time_s(planner, tour, free_start(scene.model, args.seed))
+        raise InputError(f'{error}: some {minutes_text(seconds)}') from None
 
 
 def free_start(model: CollisionModel, seed: int) -> FloatArray:

@@ -18,7 +18,7 @@ CONFIRM, COLLECT = '/remaster/confirm', '/remaster/collect'
 
 
 def fingerprint(tour: Tour) -> str:
-    """Return a checksum of the poses, solutions and order of a tour, 8 hexadecimal digits.
+    """Return a checksum of the poses, solutions, curves and order of a tour, 8 hexadecimal digits.
 
     It does not change while the tour is visited.
     """
@@ -28,6 +28,10 @@ def fingerprint(tour: Tour) -> str:
         for pose in plan.poses:
             digest.update(f'{pose.solutions.shape} {pose.correction}'.encode())
             digest.update(np.ascontiguousarray(pose.solutions).tobytes())
+            if pose.way is not None:
+                digest.update(f'{pose.way.points.shape}'.encode())
+                digest.update(np.ascontiguousarray(pose.way.points).tobytes())
+                digest.update(np.ascontiguousarray(pose.way.shares).tobytes())
     return digest.hexdigest()[:8]
 
 

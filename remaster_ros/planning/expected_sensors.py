@@ -33,6 +33,7 @@ class ExpectedSensor:
     pose_sigma_m: float = POSE_SIGMA_M
     # Error common to the markers of one frame, per axis, m, with the arm's repeatability
     frame_sigma_m: float = 0.0
+    on_request: bool = False  # It measures an arm that stands still only
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
+from remaster_ros.planning.moving_design import MOVING_S, MovingDesign, design_moving
 from remaster_ros.planning.planned_design import (
     POOL_CANDIDATES,
     DesignResult,
@@ -110,6 +111,10 @@ class TourPlanner:
     causes
         Causes that were found: configurations that separate them from their look-alikes are
         added.
+    moving_s
+        Time of measured motion, s; 0 for stop and go. Other than 0, a collection has curves
+        (`moving_design`), and neither the counts, but for the registration's, nor references nor
+        causes matter.
 
     Attributes
     ----------
@@ -121,6 +126,8 @@ class TourPlanner:
         Result of the optimal design; None without one.
     separating_design
         Configurations added to separate causes; None without causes.
+    moving_design
+        Curves that are measured in motion; None for stop and go.
     """
 
     def __init__(
@@ -132,6 +139,7 @@ class TourPlanner:
         design: DesignSettings | None = None,
         travel: TravelTime | None = None,
         causes: Sequence[FoundCause] = (),
+        moving_s: float = 0.0,
     ) -> None:
         self.scene, self._counts, self._seed = scene, counts, seed
         self._every = reference_every
@@ -141,6 +149,8 @@ class TourPlanner:
         self.design_result: DesignResult | None = None
         self._causes = tuple(causes)
         self.separating_design: SeparatingDesign | None = None
+        self.moving_s = moving_s
+        self.moving_design: MovingDesign | None = None
 
     @property
     def rough_places(self) -> dict[str, FloatArray]:
@@ -180,8 +190,10 @@ class TourPlanner:
 
         ``T_R_N``: (4, 4) each. Sets `design_result` and `separating_design`. Raises
         InsufficientDataError if no pose is left to fit; with an optimal design also as
-        `designed_plans`.
+        `designed_plans`. With `moving_s` as `moving`.
         """
+        if self.moving_s > 0.0:
+            return self.moving(T_R_N)
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
         plans = {
             split: self._plan(split, sensors_R)
@@ -206,6 +218,43 @@ class TourPlanner:
         if self._every:
             plans[REFERENCE] = self._references(plans)
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
+
+    def moving(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
+        """Return the tour of curves to fit and poses to validate, in their order.
+
+        The only pose to fit is where the first curve begins. Each of the first poses to validate
+        has its curve (`PlannedPose.way`), which begins at the pose before it.
+
+        ``T_R_N``: registrations, (4, 4) each. Sets `moving_design`. Raises as `design_moving`.
+        """
+        sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
+        rng = np.random.default_rng([self._seed, *b'moving'])
+        seconds = self.moving_s or MOVING_S
+        design = design_moving(
+            self.scene, self.travel, self.design, sensors_R, rng, seconds, self._likely_end()
+        )
+        self.moving_design = design
+        held_out = Plan((*design.ends, *design.proof))
+        return Tour(
+            self._chain,
+            {FITTED: Plan((design.begin,)), HELD_OUT: held_out},
+            in_order=True,
+            one_solution=True,
+            model=self.model,
+            order=[(FITTED, 0, 0), *((HELD_OUT, i, 0) for i in range(len(held_out.poses)))],
+        )
+
+    def _likely_end(self) -> FloatArray:
+        """Return where an arm that begins in the middle ends its registration, rad or m, (k,).
+
+        The middle if this planner plans none.
+        """
+        q: FloatArray = np.clip(np.zeros(len(self._chain)), self._chain.lower, self._chain.upper)
+        if self.registers:
+            tour = self.registration().first_poses(3).restarted_straight()
+            while (visit := tour.next(q)) is not None:
+                q = visit.solutions[-1]
+        return q
 
     def _separating(self, plan: Plan, sensors_R: Mapping[str, FloatArray]) -> Plan:
         """Return a plan with configurations added that separate the causes.

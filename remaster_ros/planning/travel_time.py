@@ -14,7 +14,15 @@ import numpy as np
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.motion.trajectory import HEADROOM, RAMP_S, STOPPABLE, Trajectory, plan_trajectory
+from remaster_ros.motion.spline import Spline
+from remaster_ros.motion.trajectory import (
+    HEADROOM,
+    RAMP_S,
+    STOPPABLE,
+    Curve,
+    Trajectory,
+    plan_trajectory,
+)
 from remaster_ros.types import FloatArray
 
 SPEED_SHARE = 0.3
@@ -110,3 +118,16 @@ class TravelTime:
         trajectory = plan_trajectory(self.limits, points, limited)
         rates = [line.rate for line in trajectory.lines]
         return trajectory, float(np.max(np.multiply(peaks, rates)))
+
+    def curve(self, points: FloatArray, shares: FloatArray) -> tuple[Curve, float]:
+        """Return the fastest motion along a curve, and its largest point speed, m/s.
+
+        ``points``: with begin and end, (n, k); ``shares``: of the curve, at these, (n,). Raises
+        ValueError as `Spline.through`.
+        """
+        spline = Spline.through(points, shares)
+        at, places = spline.samples
+        peak = float(np.max(self.speeds.fastest(places, spline.at(at, 1))))
+        limited = peak if np.isfinite(self.limits.tool_speed) else 0.0
+        curve = Curve.within(self.limits, spline, limited)
+        return curve, peak * curve.rate

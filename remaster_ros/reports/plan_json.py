@@ -12,6 +12,8 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan, Expected
+from remaster_ros.planning.moving_design import MovingDesign
+from remaster_ros.planning.moving_information import OWN_M
 from remaster_ros.planning.planned_design import DesignSettings
 from remaster_ros.planning.separating_design import DECIDED, SeparatingDesign
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Tour
@@ -55,6 +57,26 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
             if plan.separating_design is None
             else {'separate': _separated(plan.separating_design)}
         ),
+        **({} if plan.moving_design is None else {'moving': _moving(plan, plan.moving_design)}),
+    }
+
+
+def _moving(plan: CollectionPlan, design: MovingDesign) -> dict[str, Any]:
+    """Curves of a plan: times, places, share of the time in sight, and the fastest joint."""
+    chain = plan.tour.chain
+    joint, speed = design.max_joint_speed
+    return {
+        'moving_s': round(design.moving_s, 2),
+        'curves_s': [round(curve.duration_s, 2) for curve in design.curves],
+        'configurations': sum(len(end.way.points) for end in design.ends if end.way) + 1,
+        'proof_poses': len(design.ends) + len(design.proof),
+        'share_in_sight': round(design.share_in_sight, 4),
+        'fastest_joint': chain.joint_names[joint],
+        'max_joint_speed_deg_s': round(float(np.degrees(speed)), 2),
+        'max_joint_share': round(design.max_joint_share, 4),
+        'max_tool_speed_m_s': round(design.max_tool_speed_m_s, 4),
+        'own_error_mm': 1e3 * OWN_M,
+        'expected_rms_std_own_deg': float(np.degrees(design.own_rms)),
     }
 
 
@@ -87,6 +109,8 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
     """A plan as text, one subject a line: counts, time, expected precision, goal if missed."""
     visits = Counter(visit.split for visit in plan.visits)
     poses = plan.poses
+    if plan.moving_design is not None:
+        return _moving_text(plan, plan.moving_design, settings)
     lines = [
         f'to fit: {_at_poses(visits[FITTED], poses.get(FITTED, 0))}'
         + (', chosen for what they tell' if settings.optimal else ' of a Latin hypercube'),
@@ -110,6 +134,45 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
         lines += _separated_text(plan.separating_design)
     if missed := missed_goal(plan):
         lines.append(missed)
+    return '\n'.join(lines)
+
+
+def _moving_text(plan: CollectionPlan, design: MovingDesign, settings: DesignSettings) -> str:
+    """A plan with curves as text, one subject a line."""
+    visits, found = Counter(visit.split for visit in plan.visits), _moving(plan, design)
+    lines = [
+        f'to fit: {design.moving_s:.1f} s of motion, measured all along: '
+        f'{counted(len(design.curves), "curve")} through '
+        f'{counted(found["configurations"], "configuration")}, chosen for what they tell a second',
+        f'held out: {_at_poses(visits[HELD_OUT], plan.poses.get(HELD_OUT, 0))}, measured at '
+        'standstill; nothing is fitted on them',
+    ]
+    if visits[REGISTRATION]:
+        lines.append(f'registration: {counted(visits[REGISTRATION], "configuration")}')
+    if plan.unreached:
+        lines.append(f'dropped configurations: {_counts(plan.dropped)}')
+    lines += [
+        f'robot time of the whole session: {plan.robot_time_s:.0f} s '
+        f'({minutes_text(plan.robot_time_s)}), {design.moving_s:.0f} s of it measured motion',
+        f'every marker in sight: {100.0 * design.share_in_sight:.0f} % of the measured motion',
+        f'fastest joint: {found["fastest_joint"]} at {found["max_joint_speed_deg_s"]:.0f} deg/s; '
+        f'joints use at most {100.0 * design.max_joint_share:.0f} % of their speeds',
+        f'fastest point: {design.max_tool_speed_m_s:.2f} m/s in measured motion, '
+        f'{plan.max_tool_speed_m_s:.2f} m/s at all',
+    ]
+    lines += _expected_lines(plan.tour.chain, plan.joint_std, plan.joint_rms, plan.tool_rms)
+    lines.insert(
+        -1,
+        f'  {"":20s} {np.degrees(design.own_rms):.4f} deg if each marker errs by '
+        f'{1e3 * OWN_M:g} mm by itself, too',
+    )
+    goal = settings.joint_std_rad
+    if goal is not None and plan.joint_rms > goal:
+        needed = design.moving_s * (plan.joint_rms / goal) ** 2
+        lines.append(
+            f'not reached: poses.joint_std_deg {np.degrees(goal):.4f}; some {needed:.0f} s of '
+            f'motion would (--moving {np.ceil(needed):.0f})'
+        )
     return '\n'.join(lines)
 
 

@@ -9,13 +9,19 @@ async function playPlan(plan) {
   let here = plan.start;
   for (const visit of visits) {
     visit.begin = total;
-    visit.lines = visit.way.map((to, i) => {
+    visit.from = here;
+    // A curve is played through samples, a line by its ramps.
+    visit.lines = visit.times ? [] : visit.way.map((to, i) => {
       if (i) total += REST;
       const line = {from: here, to, rate: visit.rates[i], begin: total};
       total += 1 / line.rate + RAMP;
       here = to;
       return line;
     });
+    if (visit.times) {
+      total += visit.times[visit.times.length - 1];
+      here = visit.way[visit.way.length - 1];
+    }
     visit.arrive = total;
     total += plan.measuring_s;
     visit.end = total;
@@ -35,13 +41,20 @@ async function playPlan(plan) {
     }
     return low;
   };
+  const alongCurve = (visit, since) => {
+    const after = visit.times.findIndex((t) => t > since);
+    if (after < 0) return visit.way[visit.way.length - 1];
+    const [from, begin] = after ? [visit.way[after - 1], visit.times[after - 1]] : [visit.from, 0];
+    return between({from, to: visit.way[after]}, (since - begin) / (visit.times[after] - begin));
+  };
   const anglesAt = (visit, time) => {
+    if (visit.times) return alongCurve(visit, Math.max(time - visit.begin, 0));
     const line = visit.lines.filter((l) => l.begin <= time).pop() || visit.lines[0];
     return between(line, share(line, Math.max(time - line.begin, 0)));
   };
 
   let view = null;
-  const tips = (visit) => visit.lines.flatMap((line) => {
+  const tips = (visit) => visit.times ? [visit.from, ...visit.way].map((q) => view.tip(q)) : visit.lines.flatMap((line) => {
     const steps = Math.max(2, Math.ceil(Math.max(...line.from.map((a, j) => Math.abs(line.to[j] - a))) / 0.08));
     return Array.from({length: steps + 1}, (_, i) => view.tip(between(line, i / steps)));
   });
@@ -102,7 +115,7 @@ async function playPlan(plan) {
     playedVisit = index;
     bars.forEach((update) => update(q));
     slider.value = time;
-    const doing = measuring ? 'measured' : `on the way, at most ${visit.speed.toFixed(2)} m/s`;
+    const doing = measuring ? 'measured' : `${visit.times ? 'measured on the way' : 'on the way'}, at most ${visit.speed.toFixed(2)} m/s`;
     const state = `${index + 1} of ${visits.length}: ${words[visit.split]}, pose ${visit.pose + 1}, ${doing}`;
     element('state').textContent = state;
     element('clock').textContent = `${clock(time)} / ${clock(total)}`;

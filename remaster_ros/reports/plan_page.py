@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.motion.trajectory import RAMP_S, REST_S
+from remaster_ros.motion.trajectory import RAMP_S, REST_S, Trajectory
 from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
+from remaster_ros.planning.moving_information import OWN_M
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal, slides_in_rms
 from remaster_ros.reports.robot_scene import RobotScene, scene_to_dict, view_script
@@ -27,6 +29,8 @@ GENERATOR = 'remaster plan'
 HEAD_BYTES = 2000
 """Length of the head that identifies the page, bytes."""
 LARGEST_PAGE = 50_000_000
+SAMPLE_S = 0.05
+"""Time between two samples of a curve, s: at some rad/s² chords are within a milliradian of it."""
 _MARK = f'<meta name="generator" content="{GENERATOR}">'.encode()
 WORDS = {
     REGISTRATION: ('for the registration', 'the first three that are seen register the sensors'),
@@ -66,6 +70,16 @@ def plan_page(
     poses = sum(count for split, count in plan.poses.items() if split != REFERENCE)
     moving_s = plan.robot_time_s - plan.measuring_s * len(plan.visits)
     fastest = max(range(len(plan.visits)), key=lambda i: plan.visits[i].tool_speed_m_s)
+    in_motion = ''
+    if plan.moving_design is not None:
+        in_motion = (
+            f'{plan.moving_design.moving_s:.1f} s of motion along '
+            f'{counted(len(plan.moving_design.curves), "curve")} are measured all along, with '
+            f'every marker in sight for {100.0 * plan.moving_design.share_in_sight:.0f} % of '
+            f'them; the offsets are fitted on these. If each marker errs by {1e3 * OWN_M:g} mm by '
+            'itself, too, the expected standard deviation is '
+            f'{np.degrees(plan.moving_design.own_rms):.4f} degrees'
+        )
     return page(
         'plan.html.jinja',
         generator=GENERATOR,
@@ -81,6 +95,7 @@ def plan_page(
             f'point of arm and tool faster than {plan.max_tool_speed_m_s:.2f} m/s.'
         ),
         moving=minutes_text(moving_s),
+        in_motion=in_motion,
         measuring_s=f'{plan.measuring_s:g}',
         fastest=fastest + 1,
         undetermined=plan.undetermined,
@@ -176,6 +191,8 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
         visits = [visit for visit in plan.visits if visit.split == split]
         if visits:
             poses = plan.poses[split]
+            if split == FITTED and plan.moving_design is not None:
+                why = 'where the first curve begins; the offsets are fitted on the curves'
             rows.append(
                 {'split': split, 'words': words, 'why': why, 'poses': poses, 'visits': len(visits)}
             )
@@ -230,12 +247,27 @@ def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
             {
                 'split': visit.split,
                 'pose': visit.pose,
-                'way': [_rounded(q) for q in visit.points[1:]],
-                'rates': [round(line.rate, 6) for line in visit.trajectory.lines],
+                **_way(visit.trajectory),
                 'speed': round(visit.tool_speed_m_s, 4),
             }
             for visit in plan.visits
         ],
+    }
+
+
+def _way(trajectory: Trajectory) -> dict[str, Any]:
+    """Corners of lines, and the rate of each; or samples of a curve, and their times, s."""
+    if trajectory.is_curve:
+        times = np.append(
+            np.arange(SAMPLE_S, trajectory.duration_s, SAMPLE_S), trajectory.duration_s
+        ).tolist()
+        return {
+            'way': [_rounded(trajectory.at(time_s)[0]) for time_s in times],
+            'times': [round(time_s, 3) for time_s in times],
+        }
+    return {
+        'way': [_rounded(q) for q in trajectory.points[1:]],
+        'rates': [round(line.rate, 6) for line in trajectory.lines],
     }
 
 

@@ -435,6 +435,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
                 sensor.noise_m,
                 sensor.pose_noise_m,
                 sensor.frame_noise_m,
+                sensor.single_shot,
             )
             for name, sensor in self.sensors.items()
         ]

@@ -27,3 +27,22 @@ def write_cell(path: Path, **changes) -> Path:
     cell['robot']['urdf'] = str((demo.parent / cell['robot']['urdf']).resolve())
     path.write_text(yaml.safe_dump({**cell, **changes}))
     return path
+
+
+def four_markers(path: Path, count: int = 4, **changes) -> Path:
+    """Write the demo cell with a camera alone, which sees so many markers on the tool."""
+    places = {
+        'sir': [0.1, 0.0, 0.0],
+        'sir_2': [0.02, 0.09, 0.0],
+        'sir_3': [0.04, -0.06, 0.05],
+        'sir_4': [-0.1, 0.0, 0.02],
+    }
+    markers = dict(list(places.items())[:count])
+    camera = {
+        'marker': 'sir',
+        'further_markers': {name: number for number, name in enumerate(markers, 1) if number > 1},
+        'topic': 'optitrack/marker',
+        'rough_position_m': [1.9, 0.0, 1.3],
+    }
+    given = {'markers': markers, 'sensors': {'mocap': camera}, 'aim_at': 'mocap'}
+    return write_cell(path, **{**given, **changes})

@@ -2,19 +2,22 @@
 """`remaster plan`: what is printed, as text and as JSON, and what is refused."""
 
 import json
+import re
 
 import pytest
 from rigs.command_line import refusal, remaster
 from worlds.discovery_files import discovery_content, effect, look_alike
-from worlds.simple_cells import edited_cell
+from worlds.simple_cells import edited_cell, four_markers
+from worlds.sliding_cells import rail, sliding_cell
 
-from remaster_ros.planning import planned_design, pose_design, tour_planner
+from remaster_ros.planning import moving_design, planned_design, pose_design, tour_planner
 
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     monkeypatch.setattr(planned_design, 'POOL_CANDIDATES', 60)
     monkeypatch.setattr(pose_design, 'EFFORT', 300)
+    monkeypatch.setattr(moving_design, 'EXCHANGES', 15)
 
 
 HYPERCUBE = '  design: latin_hypercube\n'
@@ -157,3 +160,48 @@ def test_without_look_alikes_there_is_nothing_to_separate(tmp_path):
     said = refusal('plan', 'demo', *FEW, '--separate', path)
     assert 'none of its causes has a look-alike' in said
     assert 'none.json' in refusal('plan', 'demo', '--separate', tmp_path / 'none.json')
+
+
+def test_measured_motion_is_planned_and_said(tmp_path):
+    cell = four_markers(tmp_path / 'cell.yaml', poses={'joint_std_deg': 0.0005})
+    found = as_json(cell, '--moving', 14)
+    moving = found['moving']
+    assert moving['moving_s'] == pytest.approx(sum(moving['curves_s']), abs=0.1)
+    assert len(moving['curves_s']) == 2
+    assert moving['share_in_sight'] > 0.99
+    assert moving['max_joint_share'] <= 1.0
+    assert moving['max_tool_speed_m_s'] <= 0.25
+    assert moving['proof_poses'] == found['splits']['validation']['visits'] == 8
+    assert found['splits']['optimization']['visits'] == 1
+    assert found['splits']['registration']['visits'] == 3
+    assert found['robot_time_s'] > moving['moving_s'] + 3.5 * 12
+    assert 0.0 < found['expected_std_deg']['joint_2'] < 0.05
+    assert moving['expected_rms_std_own_deg'] > 1.5 * found['expected_rms_std_deg']
+    assert found['goal'] is None
+    out, err = remaster('plan', cell, '--moving', 14)
+    assert err == ''
+    for words in (
+        f'to fit: {moving["moving_s"]:.1f} s of motion, measured all along: 2 curves',
+        'held out: 8 configurations at 8 poses, measured at standstill',
+        f'robot time of the whole session: {found["robot_time_s"]:.0f} s',
+        'every marker in sight: 100 % of the measured motion',
+        f'fastest joint: {moving["fastest_joint"]} at ',
+        'deg if each marker errs by 0.05 mm by itself, too',
+        'not reached: poses.joint_std_deg 0.0005; some ',
+    ):
+        assert words in out
+    assert 'moving' not in as_json('demo', *FEW)
+
+
+def test_cells_that_cannot_be_measured_in_motion_are_refused_with_the_time_otherwise(tmp_path):
+    said = refusal('plan', 'demo', *FEW, '--moving')
+    assert 'mocap sees 1 marker, and motion takes 4' in said
+    assert re.search(r'or measure by stop and go: some \d+\.\d min$', said)
+    three = four_markers(tmp_path / 'three.yaml', count=3)
+    assert 'mocap sees 3 markers, and motion takes 4' in refusal('plan', three, *FEW, '--moving')
+    path = sliding_cell(tmp_path, rail())
+    assert 'slides' in refusal('plan', path, *FEW, '--moving')
+    four = four_markers(tmp_path / 'four.yaml')
+    found = refusal('plan', four, '--moving', '--separate', 'causes.json')
+    assert 'leave one of them out' in found
+    assert '--moving' in refusal('plan', four, '--moving', 3)

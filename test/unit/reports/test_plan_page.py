@@ -12,9 +12,12 @@ import pytest
 from judges.html_page import Page
 from py_mini_racer import JSEvalException, JSParseException, MiniRacer
 from rigs.browser import NO_WEBGL, seen
+from worlds.simple_cells import four_markers
 
 from remaster_ros import reports
 from remaster_ros.cli import main as cli
+from remaster_ros.cli import plan as plan_verb
+from remaster_ros.planning import moving_design
 from remaster_ros.reports.plan_page import write_plan_page
 from remaster_ros.reports.robot_scene import view_script
 from remaster_ros.session.workcell import read_cell
@@ -139,6 +142,42 @@ def test_every_configuration_is_played_in_its_own_time(planned):
     # On paper there is a picture, too: a copy, as what WebGL has drawn is not printed.
     assert found['colors'] > 100
     assert not found['paper']
+
+
+def test_a_curve_is_played_as_it_is_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(moving_design, 'EXCHANGES', 5)
+    cell, path, plans = four_markers(tmp_path / 'cell.yaml'), tmp_path / 'plan.html', []
+    drawn = plan_verb.plan_page
+    monkeypatch.setattr(
+        plan_verb, 'plan_page', lambda plan, *args: plans.append(plan) or drawn(plan, *args)
+    )
+    assert cli.main(['plan', str(cell), '--moving', '14', '--quiet', '--out', str(path)]) == 0
+    (plan,) = plans
+    before = [visit.trajectory.duration_s + plan.measuring_s for visit in plan.visits[:4]]
+    since = np.array([1.23, 4.56])
+    page = Page(path.read_text(encoding='utf-8'))
+    assert 's of motion along 2 curves are measured all along, with every marker' in page.text
+    found = seen(
+        path,
+        """
+        const slider = document.getElementById('time');
+        const shown = [];
+        for (const time of TIMES) {
+            slider.value = time;
+            slider.dispatchEvent(new Event('input'));
+            const angles = [...document.querySelectorAll('#joints .n')];
+            shown.push({state: document.getElementById('state').textContent,
+                        angles: angles.map((cell) => cell.textContent)});
+        }
+        return {shown, total: Number(slider.max)};
+        """.replace('TIMES', json.dumps((sum(before) + since).tolist())),
+    )
+    assert found['total'] == pytest.approx(plan.robot_time_s, abs=0.1)
+    for time_s, shown in zip(since, found['shown'], strict=True):
+        assert shown['state'].startswith(f'5 of {len(plan.visits)}: held out, pose 1, measured on')
+        angles = [float(text[:-1].replace('\u2212', '-')) for text in shown['angles']]
+        there = np.degrees(plan.visits[4].trajectory.at(time_s)[0])
+        np.testing.assert_allclose(angles, there, atol=0.2)
 
 
 def test_without_webgl_the_page_says_so_and_has_all_else(planned):
