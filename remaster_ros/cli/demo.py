@@ -13,6 +13,7 @@ from typing import NoReturn
 
 from remaster_ros.cli.options import integer, number
 from remaster_ros.errors import InputError
+from remaster_ros.planning.moving_design import LONGEST_MOVING_S, MOVING_S, SHORTEST_MOVING_S
 
 WITHOUT_ROS = (
     "needs ROS 2 Jazzy: source /opt/ros/jazzy/setup.bash, or pip install '.[jazzy]' for the wheels"
@@ -71,6 +72,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--moving` can read the bag of the session; takes as long as a real arm',
     )
     parser.add_argument(
+        '--moving',
+        nargs='?',
+        type=number(SHORTEST_MOVING_S, LONGEST_MOVING_S, 's'),
+        const=MOVING_S,
+        default=0.0,
+        metavar='SECONDS',
+        help=f'measure while the arm moves, for so long (default {MOVING_S:g} s), and prove it on '
+        'poses at standstill; the arm has dynamics (--dynamics, by default 1)',
+    )
+    parser.add_argument(
         '--rate',
         type=number(1.0, 20.0),
         help='world time over wall time (1 to 20; default 10, with --dynamics 1)',
@@ -86,6 +97,9 @@ def run(args: argparse.Namespace) -> NoReturn:
     Raises InputError if rclpy is not installed.
     """
     out = Path(args.out) if args.out else free_folder()
+    if args.moving and (args.hide or args.apply or args.candidates):
+        raise InputError('--moving goes without --hide, --apply, --candidates and --full')
+    dynamics = args.dynamics or float(args.moving > 0.0)
     become(
         'demo',
         ['remaster_ros.demo'],
@@ -93,8 +107,9 @@ def run(args: argparse.Namespace) -> NoReturn:
             'out': str(out),
             'seed': args.seed,
             **_collection(args.candidates, bool(args.hide)),
-            'rate': args.rate or (1.0 if args.dynamics else 10.0),
-            'dynamics': args.dynamics,
+            **({'cell': 'moving', 'moving_s': args.moving} if args.moving else {}),
+            'rate': args.rate or (1.0 if dynamics else 10.0),
+            'dynamics': dynamics,
             'figures': not args.no_figures,
             'quiet': args.quiet,
             'hide': ','.join(args.hide),

@@ -49,6 +49,14 @@ class Parameters:
         low=0.0,
         high=10.0,
     )
+    moving_s: float = parameter(
+        0.0,
+        'seconds of motion that are measured while the arm moves (with dynamics); 0 for stop and '
+        'go',
+        unit='s',
+        low=0.0,
+        high=600.0,
+    )
     figures: bool = parameter(True, 'write figures and the report')
     apply: bool = parameter(
         False, 'correct the arm by what was found, and measure poses that no fit has seen'

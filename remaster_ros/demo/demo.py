@@ -67,6 +67,9 @@ REPORTS_HZ, FRAMES_HZ = 125.0, 120.0
 """Rates of joint states and frames of an arm with dynamics, Hz."""
 LAST_MESSAGES = 50
 """Most messages under way from nodes that have ended."""
+TRACKER, OF_TRACKER = 'tracker', ('fake_laser_tracker', 'laser_tracker_markers')
+"""Name of the laser tracker in the cells of the demo, and its nodes."""
+READY = {'state': 'ready'}
 BEFORE_SESSION = {'log', 'ros_home', 'session'}
 """Contents of the folder of a demo that was interrupted before its session began."""
 
@@ -126,6 +129,8 @@ class Demo:
                 f'{self.candidates} candidate poses in place of {self.p.candidates}, of which too '
                 f'few can be reached with seed {self.p.seed}'
             )
+        # Nodes of a sensor that the cell does not have.
+        self._absent = set() if TRACKER in cell.sensors else set(OF_TRACKER)
         self.hidden = Path(tempfile.mkdtemp(prefix='remaster_world_'))
         try:
             with undone_on_failure():
@@ -199,6 +204,8 @@ class Demo:
 
         Returns label, folder and file of each result. Raises DeviceError if a service refuses.
         """
+        if self.p.moving_s:
+            return self._estimate_moving()
         self.console.print('fitting')
         self._trigger('remaster/fit', 'optimizer', timeout_s=WORK_WALL_S)
         results = [('report', self.fit, 'fit.json')]
@@ -207,6 +214,32 @@ class Demo:
             self._trigger('remaster/discover', 'optimizer', timeout_s=WORK_WALL_S)
             results.append(('causes', self.discovery, 'discovery.json'))
         return results
+
+    def _estimate_moving(self) -> list[tuple[str, Path, str]]:
+        """Import the motion from the session's bag, and fit it with the poses at standstill.
+
+        Returns as `_estimate`. Raises DeviceError if one of the commands fails.
+        """
+        # The recorder has closed the bag with the session.
+        moving, figures = self.out / 'moving', [] if self.p.figures else ['--no-figures']
+        bag = str(self.session / 'bag')
+        session = ['--proof', str(self.session), '--out', str(moving)]
+        self._remaster('import', '--moving', bag, '--cell', self.p.cell, *session)
+        self._remaster('fit', str(moving), '--out', str(self.fit), *figures)
+        return [('report', self.fit, 'fit.json')]
+
+    def _remaster(self, *arguments: str) -> None:
+        """Run a command of `remaster`, and print what it says; raise DeviceError if it fails."""
+        self.console.print(f'remaster {" ".join(arguments)}', soft_wrap=True)
+        done = subprocess.run(
+            [sys.executable, '-m', 'remaster_ros.cli.main', *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        self.console.print(done.stdout.strip(), soft_wrap=True, markup=False, highlight=False)
+        if done.returncode:
+            raise DeviceError(f'remaster {arguments[0]}: {done.stderr.strip()}')
 
     def _apply(self) -> Path:
         """Collect again with the bridge's correction; return the file of the correction.
@@ -260,15 +293,16 @@ class Demo:
         ports = {'command_port': command_port, 'data_port': data_port}
         world = str(self.hidden)
         fast = bool(self.p.dynamics)
-        overrides: dict[str, dict[str, Any]] = {
+        values: dict[str, dict[str, Any]] = {
             'fake_robot': {'world': world, **({'joint_state_rate': REPORTS_HZ} if fast else {})},
             'fake_optitrack': {'world': world, **ports, **({'rate': FRAMES_HZ} if fast else {})},
             'fake_laser_tracker': {'world': world, 'port': tracker_port},
             'optitrack_markers': {**ports, 'cell': self.p.cell},
             'laser_tracker_markers': {'port': tracker_port, 'cell': self.p.cell},
         }
-        for name, values in overrides.items():
-            self.processes.start(name, common, values)
+        for name, overrides in values.items():
+            if name not in self._absent:
+                self.processes.start(name, common, overrides)
         size = self.candidates
         held_out = self.p.held_out_candidates or size
         self._start_core(self.session, self.p.seed, size, held_out)
@@ -298,6 +332,7 @@ class Demo:
                 'optimization_candidates': size,
                 'validation_candidates': held_out,
                 'reference_every': self.p.reference_every,
+                'moving_s': self.p.moving_s,
             },
             'robot_bridge': {**cell, **rate, 'compensation': compensation},
             'recorder': {**cell, **rate, 'session': str(session)},
@@ -353,9 +388,9 @@ class Demo:
         """
         summaries = self.node.summaries
         return (
-            summaries.keys() >= {*CORE, *SENSORS}
+            summaries.keys() >= {*CORE, *SENSORS} - self._absent
             and summaries['pose_planner']['robot'] == 'heard'
-            and summaries['laser_tracker_markers']['state'] == 'ready'
+            and summaries.get('laser_tracker_markers', READY)['state'] == 'ready'
             and summaries['optitrack_markers']['published'] != '0'
         )
 

@@ -476,6 +476,12 @@ class PosePlanner(RemasterNode):
                 self._session_s = session_time_s(self._tours, tour, self._q)
                 minutes = f'{self._session_s / 60.0:.1f} min'
                 planned += f'; about {minutes} of robot time for the whole session'
+            if self.p.moving_s and not tour.inspection:
+                planned += (
+                    '; measured while the arm moves: when complete, remaster import --moving '
+                    f'{self.p.session}/bag --cell {self.p.cell} --proof {self.p.session}, then '
+                    'remaster fit'
+                )
             self.status.event(events.TourPlanned(planned))
         with self._lock:
             # If paused or stopped while the visit was planned, collect announces it.

@@ -28,6 +28,7 @@ from judges.documented_commands import (
     small,
 )
 from judges.documented_commands import PAGES as ALL
+from worlds.simple_cells import four_markers
 
 from remaster_ros.cli.main import VERBS, main
 
@@ -149,6 +150,8 @@ def supply(word: str, readers_files: Path, here: Path) -> None:
         rows = list(csv.reader(Path('made/observations.csv').read_text('utf-8').splitlines()))
         kept = [c for c in zip(*rows) if re.match('q[1-7]_|[xyz]_|orientation_', c[0])]
         write(Path(), name, text([c[0] for c in kept], [c[1:] for c in kept]))
+    elif name == 'four_markers.yaml':
+        four_markers(Path(name))
     elif name == 'my_cell.yaml':
         cell = (ROOT / 'config/cells/demo.yaml').read_text('utf-8')
         Path(name).write_text(cell.replace('../robots', str(ROOT / 'config/robots')), 'utf-8')

@@ -61,6 +61,13 @@ def test_what_an_arm_with_a_joint_that_slides_is_not_for(node, parameters, why, 
     assert not (tmp_path / 'out').exists()
 
 
+def test_motion_that_the_sensors_of_the_cell_cannot_measure(start, tmp_path):
+    """At the start, and not when the arm has been moved for the registration."""
+    line = refuse(start, 'pose_planner', cell='quick', moving_s=40.0, session=tmp_path / 's')
+    assert 'mocap sees 3 markers, and motion takes 4' in line
+    assert not (tmp_path / 's').exists()
+
+
 def test_a_session_folder_that_is_in_use(start, tmp_path):
     (tmp_path / 'session').mkdir()
     (tmp_path / 'session' / 'observations.csv').write_text('mine\n')

@@ -13,6 +13,11 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.limits import SLOWEST_M_S
 from remaster_ros.nodes.parameters import parameter
 from remaster_ros.nodes.planner.inspections import InspectionParameters
+from remaster_ros.planning.moving_design import (
+    LONGEST_MOVING_S,
+    SHORTEST_MOVING_S,
+    check_sensors,
+)
 from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
@@ -73,6 +78,15 @@ class Parameters(InspectionParameters):
         low=0.0,
         high=45.0,
     )
+    moving_s: float = parameter(
+        0.0,
+        'seconds of motion along curves that are measured while the arm moves, between poses that '
+        'are measured at standstill and never fitted; 0 for stop and go',
+        unit='s',
+        low=SHORTEST_MOVING_S,
+        high=LONGEST_MOVING_S,
+        off=0.0,
+    )
     speed_share: float = parameter(
         SPEED_SHARE,
         'as of robot_bridge: what `poses.design: optimal` and `poses.order: fastest` of a cell '
@@ -92,7 +106,10 @@ class Parameters(InspectionParameters):
     def tour_planner(
         self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
     ) -> TourPlanner:
-        """Return the planner of the tours of a cell; ``causes``: to be separated."""
+        """Return the planner of the tours of a cell; ``causes``: to be separated.
+
+        Raises InputError if what its sensors measure in motion is asked for, and they cannot.
+        """
         scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
         counts = {
             'optimization': self.optimization_candidates,
@@ -106,7 +123,19 @@ class Parameters(InspectionParameters):
             cell.acceleration_limits(chain),
         )
         design = cell.design_settings()
-        return TourPlanner(scene, counts, self.seed, self.reference_every, design, travel, causes)
+        if self.moving_s:
+            # At the start, and not when the arm has been moved to register the sensors.
+            check_sensors(scene, design.sensors)
+        return TourPlanner(
+            scene,
+            counts,
+            self.seed,
+            self.reference_every,
+            design,
+            travel,
+            causes,
+            moving_s=self.moving_s,
+        )
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
         """Return the causes that the plan has to separate, () if none are given.
@@ -139,6 +168,7 @@ class Parameters(InspectionParameters):
             'reference_every': self.reference_every,
             'limit_margin_deg': self.limit_margin_deg,
             # Only these plans depend on them.
-            **(speeds if design.optimal or design.fastest else {}),
+            **(speeds if design.optimal or design.fastest or self.moving_s else {}),
+            **({'moving_s': self.moving_s} if self.moving_s else {}),
             **({'separate': repr(causes)} if causes else {}),
         }

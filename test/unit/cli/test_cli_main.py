@@ -114,3 +114,23 @@ def test_every_verb_that_prints_results_takes_json():
     for verb in set(cli.VERBS) - without:
         parser = cli.build_parser(verb)._subparsers._group_actions[0].choices[verb]
         assert '--json' in parser._option_string_actions, verb
+
+
+@pytest.mark.parametrize('other', [['--hide', 'backlash@4'], ['--apply'], ['--full']])
+def test_a_moving_demo_refuses_what_it_does_not_take(other, capsys, monkeypatch):
+    monkeypatch.setattr('remaster_ros.cli.demo.become', lambda *_: pytest.fail('it began'))
+    assert cli.main(['demo', '--moving', *other]) == 2
+    assert capsys.readouterr().err.startswith('error: --moving goes without')
+
+
+@pytest.mark.parametrize(('given', 'moving_s'), [([], 40.0), (['30'], 30.0)])
+def test_a_moving_demo_has_dynamics_and_takes_the_time_of_a_real_arm(given, moving_s, monkeypatch):
+    begun = {}
+    monkeypatch.setattr('remaster_ros.cli.demo.become', lambda *how: begun.update(how[2]) or 0)
+    cli.main(['demo', '--moving', *given, '--out', 'x'])
+    wanted = {'cell': 'moving', 'moving_s': moving_s, 'dynamics': 1.0, 'rate': 1.0}
+    assert begun.items() >= wanted.items()
+    begun.clear()
+    cli.main(['demo', '--out', 'x'])
+    assert begun['dynamics'] == 0.0
+    assert 'moving_s' not in begun
