@@ -405,6 +405,9 @@ class MotionUnderWay:
             return None
         low_s, high_s = following.window(seen, wall_s, rate)
         if following.trajectory.is_curve and high_s >= JOINED_S:
+            if high_s >= following.trajectory.duration_s:
+                # Its controller rests at the end, and the arm comes there.
+                return None
             return self._stop_on_curve(reason, seen, wall_s, rate)
         if self._piece is not None:
             # Behind that it is on the stop of its piece.

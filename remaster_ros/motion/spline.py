@@ -21,10 +21,11 @@ STRAIGHT_SHARE = 0.6
 SAGITTA_RAD = 2e-4
 """The samples of a spline are so near that no chord between two is further from it, rad: at the
 end of an arm of a metre 0.2 mm, which the path check adds to the clearance."""
-MOST_POINTS = 500
-"""A curve through more configurations is refused: with one a second that is eight minutes."""
-MOST_SAMPLES = 20_000
-"""A curve that needs more samples is refused: a minute of motion needs some 2,000, noise more."""
+MOST_POINTS = 100
+"""A curve through more places is refused: with one a second that is a minute and a half."""
+MOST_SAMPLES = 4_000
+"""A curve that needs more samples is refused: a minute of motion needs some 2,000, noise more.
+With both the check of a curve takes some hundredths of a second."""
 NEWTON_ROUNDS = 3
 """Steps from the nearest place on a chord to the nearest on the curve, to 1e-9 rad."""
 

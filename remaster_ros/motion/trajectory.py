@@ -184,8 +184,8 @@ class Curve(RampedPath):
         """Return the fastest motion along a spline within the limits, less `HEADROOM`.
 
         At every place within the speeds, and within the accelerations also of a stop in `RAMP_S`
-        from there. The straight piece at the beginning takes at least `LEAD_S`, and that at the
-        end holds the ramp. ``peak_m``: as of `Line.within`.
+        from there. The straight piece at the beginning is begun and stopped as a line is, and
+        takes at least `LEAD_S`; that at the end holds the ramp. ``peak_m``: as of `Line.within`.
         """
         shares, _ = spline.samples
         first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
@@ -193,8 +193,9 @@ class Curve(RampedPath):
         # r² |q''| + r |q'| / RAMP_S = a, solved for the rate r in a form that needs no q''.
         a, b = HEADROOM * limits.acceleration, first / RAMP_S
         rates = 2.0 * a / (b + np.sqrt(b**2 + 4.0 * second * a) + 1e-300)
+        lead = np.max(first[0] / (STOPPABLE * limits.acceleration * RAMP_S))
         rate = min(
-            float(HEADROOM / max(speed, 1e-12)),
+            float(HEADROOM / max(speed, lead, 1e-12)),
             float(np.min(rates)),
             spline.straight_until / LEAD_S,
             (1.0 - spline.straight_from) / RAMP_S,
