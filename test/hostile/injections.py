@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from hostile.arm import Command
 from hostile.bench import Bench
 from hostile.lines import COMMANDS, INTRUDER, RELIABLE
 from hostile.scene import ANSWER_S, HOME, SPREAD, Scene
@@ -99,11 +100,11 @@ def emergency_while_braking(s: Scene) -> None:
     """Pressed on the way of a stop, and released; a sensor was missing for a moment."""
     bench, asked = s.bench, time.monotonic()
     bench.waiting_for = 'mocap'
-    if not bench.until(lambda: bench.commands_since(asked), 1.5):
+    if not bench.until(lambda: _stops(bench, asked), 1.5):
         s.expected, bench.waiting_for = 'any', ''
         return
-    stop = bench.commands_since(asked)[0]
-    s.wait(0.0, stop.times_s[-1])
+    stop = _stops(bench, asked)[0]
+    s.wait(0.0, max(stop.end_s - time.monotonic(), 0.0))
     pressed = time.monotonic()
     bench.arm.stop_by_brakes(pressed)
     s.wait(0.3, 1.5)
@@ -113,6 +114,18 @@ def emergency_while_braking(s: Scene) -> None:
     s.silent_from, s.expected = (pressed, '') if off > MOST_OFF_RAD else (None, 'any')
     bench.arm.release(time.monotonic())
     bench.waiting_for = ''
+
+
+def _stops(bench: Bench, since_s: float) -> list[Command]:
+    """Return the stops since a time: what ends before the command under way, or has no stamp."""
+    found, before_s = [], np.inf
+    for command in bench.commands_since(since_s - 2.0):
+        if command.arrival_s > since_s and (
+            command.begins_s is None or command.end_s < before_s - 0.01
+        ):
+            found.append(command)
+        before_s = command.end_s
+    return found
 
 
 def named_twice(s: Scene) -> None:
