@@ -32,7 +32,7 @@ class Tours:
 
     def __init__(self, references=0, held_out=0):
         self.references, self.held_out = references, held_out
-        self.standing, self.seen = '', []
+        self.standing, self.seen, self.moving_design = '', [], None
 
     def registration(self):
         return Tour(CHAIN, {REGISTRATION: plan_of(1, 2, 1)}, in_order=True)
