@@ -47,7 +47,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.unmodelled import Unmodelled
 from remaster_ros.discovery.walk import Walk, at_any_time
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import FloatArray, Session
 
 SETS = ('panda_left', 'meca500_repeats', 'ur10_two_solutions', 'ur10_iso_cubes')

@@ -24,7 +24,7 @@ from common import machine, table
 from worlds.hidden_arm import six_joint_arm
 
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor

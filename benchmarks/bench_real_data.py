@@ -28,7 +28,7 @@ from scipy.stats import chi2, kurtosis
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.calibration.grouped_rows import Rows
 from remaster_ros.calibration.sampling import sample_posterior
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import FloatArray
 
 # Largest held-out mean that is as good as the independent fit's, mm.

@@ -29,7 +29,7 @@ from common import machine, table
 from worlds.paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, experiment, sensor_frames
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 

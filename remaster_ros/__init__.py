@@ -56,7 +56,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     ...
     remaster_ros.errors.InputError: no_such_folder: no such session folder; give ...
     """
-    from remaster_ros.session import reader
+    from remaster_ros.session.records import reader
 
     return reader.read_session(folder)
 
@@ -125,7 +125,7 @@ def session_from(
     from remaster_ros.importing.assemble import SessionOptions
     from remaster_ros.importing.rows import TableOptions
     from remaster_ros.importing.units import ANGLES, LENGTHS
-    from remaster_ros.session.robot_description import read_arm
+    from remaster_ros.session.cells.robot_description import read_arm
 
     if angles not in ('', *ANGLES) or length not in ('', *LENGTHS):
         raise InputError(
@@ -209,7 +209,7 @@ def import_table(
     from remaster_ros.importing.assemble import SessionOptions
     from remaster_ros.importing.columns import ColumnChoice
     from remaster_ros.importing.rows import TableOptions
-    from remaster_ros.session.robot_description import read_arm
+    from remaster_ros.session.cells.robot_description import read_arm
 
     choices = in_python.Choices(
         TableOptions(
@@ -375,7 +375,7 @@ def simulate(
     import numpy as np
 
     from remaster_ros.errors import InputError
-    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.session.cells.workcell import read_cell
     from remaster_ros.simulation.effect_sampling import EffectSpec
     from remaster_ros.simulation.simulated_workcell import (
         DEFAULT_OFFSET_STD,
@@ -446,7 +446,7 @@ def plan(
     """
     import numpy as np
 
-    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.session.cells.workcell import read_cell
     from remaster_ros.simulation.simulated_workcell import plan_tour
 
     workcell = read_cell(os.fspath(cell))

@@ -36,8 +36,8 @@ from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import integer
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.session.files import make_folder, writing
-from remaster_ros.session.journal import Journal
 from remaster_ros.session.manifest import MANIFEST
+from remaster_ros.session.records.journal import Journal
 from remaster_ros.version import __version__
 
 FORMAT = 'remaster-batch/1'
@@ -161,7 +161,7 @@ def run(args: argparse.Namespace) -> int:
 def _refuse_foreign(folder: Path) -> None:
     """Raise InputError if the folder has results of another command, or a session."""
     from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, WRITTEN
-    from remaster_ros.session.reader import HEADER
+    from remaster_ros.session.records.reader import HEADER
 
     with writing(folder):
         there = sorted(path.name for path in folder.iterdir())

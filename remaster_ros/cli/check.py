@@ -30,8 +30,8 @@ from remaster_ros.compensation.iso9283 import IsoFigures, iso_figures
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.reports.check_page import write_check_page
-from remaster_ros.session.journal import Journal, format_record
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.journal import Journal, format_record
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import Session
 
 FORMAT = 'remaster-check/1'

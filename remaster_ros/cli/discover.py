@@ -27,7 +27,7 @@ from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.result_folder import prepare_folder, save_discovery
 from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.files import undone_on_failure
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from remaster_ros.reports.result_folder import prepare_folder, save_fit
     from remaster_ros.reports.sentences import fit_lines
     from remaster_ros.session.files import undone_on_failure
-    from remaster_ros.session.priors_file import read_priors
+    from remaster_ros.session.records.priors_file import read_priors
 
     session, named = read_together(args.session)
     priors = read_priors(args.prior) if args.prior is not None else None

@@ -37,9 +37,9 @@ from remaster_ros.importing.units import ANGLES, LENGTHS
 from remaster_ros.kinematics.pad_angles import pad_in_words
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
-from remaster_ros.session.reader import HEADER, read_session, write_session
-from remaster_ros.session.robot_description import read_arm
-from remaster_ros.session.workcell import Workcell, read_cell
+from remaster_ros.session.cells.robot_description import read_arm
+from remaster_ros.session.cells.workcell import Workcell, read_cell
+from remaster_ros.session.records.reader import HEADER, read_session, write_session
 from remaster_ros.types import SensorKind, Session
 
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'bar': '|', 'blank': ' '}

@@ -35,7 +35,11 @@ from remaster_ros.planning.collection_plan import FITTED, count_with_free_path, 
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import outlook_text, outlook_to_dict
-from remaster_ros.session.cell_template import SENSORS, CellProposal, cell_text, rail_advice
+from remaster_ros.session.cells.cell_template import SENSORS, CellProposal, cell_text, rail_advice
+from remaster_ros.session.cells.meshes import find_mesh, mesh_reader
+from remaster_ros.session.cells.packages import package_of
+from remaster_ros.session.cells.robot_description import is_xacro, read_description
+from remaster_ros.session.cells.workcell import LINK_RADIUS_M, Workcell, parse_cell
 from remaster_ros.session.files import (
     URDF_LIMIT,
     make_folder,
@@ -43,10 +47,6 @@ from remaster_ros.session.files import (
     undone_on_failure,
     write_atomically,
 )
-from remaster_ros.session.meshes import find_mesh, mesh_reader
-from remaster_ros.session.packages import package_of
-from remaster_ros.session.robot_description import is_xacro, read_description
-from remaster_ros.session.workcell import LINK_RADIUS_M, Workcell, parse_cell
 
 # Tool poses for the comparison of held joints; candidate poses for the ranges.
 COMPARED = 80

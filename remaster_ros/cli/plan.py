@@ -36,8 +36,8 @@ from remaster_ros.reports.found_causes import read_causes
 from remaster_ros.reports.plan_json import minutes_text, plan_text, plan_to_dict
 from remaster_ros.reports.plan_page import check_plan_page, plan_page, write_plan_page
 from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.session.cells.workcell import Workcell, read_cell
 from remaster_ros.session.files import write_atomically
-from remaster_ros.session.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
 
 # Start configurations that are tried, from zero outwards.

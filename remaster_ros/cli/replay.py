@@ -10,7 +10,7 @@ from remaster_ros.cli.console import progress_bar, show
 from remaster_ros.cli.demo import run_node
 from remaster_ros.cli.options import number
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bags.bag import BagReader
 from remaster_ros.session.files import undone_on_failure
 
 SHOWN = 5
@@ -94,7 +94,7 @@ def _write(args: argparse.Namespace) -> int:
         record_from_bag,
         session_beside,
     )
-    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.session.cells.workcell import read_cell
 
     folder = bag_folder(Path(args.bag))
     bag = BagReader(folder)

@@ -19,7 +19,7 @@ from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE
 from remaster_ros.reports.report import PlanFacts, plan_facts, plan_to_dict
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.files import undone_on_failure
-from remaster_ros.session.plan_journal import read_plan
+from remaster_ros.session.records.plan_journal import read_plan
 
 FIT_FOLDER = 'fit'
 

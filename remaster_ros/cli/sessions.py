@@ -10,8 +10,8 @@ from pathlib import Path
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
-from remaster_ros.session.reader import ROWS, read_session
-from remaster_ros.session.together import disagreements, together
+from remaster_ros.session.records.reader import ROWS, read_session
+from remaster_ros.session.records.together import disagreements, together
 from remaster_ros.types import Session
 
 log = logging.getLogger('remaster_ros')

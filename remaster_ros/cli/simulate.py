@@ -11,9 +11,9 @@ import numpy as np
 
 from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.options import add_poses, names, number
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.files import undone_on_failure, write_atomically
-from remaster_ros.session.reader import write_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.simulated_workcell import (
     choose_robot,

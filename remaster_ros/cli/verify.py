@@ -25,7 +25,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.planning.tour_order import nearest_solution
-from remaster_ros.session.reader import HEADER, ROWS, read_session
+from remaster_ros.session.records.reader import HEADER, ROWS, read_session
 from remaster_ros.types import BoolArray, Correction, FloatArray, IntArray, Session
 
 FORMAT = 'remaster-verify/1'

@@ -10,9 +10,9 @@ from remaster_ros.cli.console import show
 from remaster_ros.cli.demo import run_node
 from remaster_ros.cli.options import integer
 from remaster_ros.errors import InputError
+from remaster_ros.session.cells.rviz_config import rviz_config
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.files import write_atomically
-from remaster_ros.session.rviz_config import rviz_config
-from remaster_ros.session.workcell import read_cell
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

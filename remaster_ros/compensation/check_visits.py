@@ -14,8 +14,8 @@ from remaster_ros.compensation.checking import chosen_poses
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.session.cells.workcell import Workcell
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.workcell import Workcell
 from remaster_ros.types import FloatArray
 
 # Configurations of a check: four find a change of 0.26 mm, eight one of 0.17 mm, and sixteen take

@@ -42,10 +42,10 @@ from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit
+from remaster_ros.session.cells.workcell import Workcell, config_path, read_cell
 from remaster_ros.session.files import cannot_write, make_folder, undone_on_failure
-from remaster_ros.session.reader import HEADER, read_session
-from remaster_ros.session.session_journal import is_complete
-from remaster_ros.session.workcell import Workcell, config_path, read_cell
+from remaster_ros.session.records.reader import HEADER, read_session
+from remaster_ros.session.records.session_journal import is_complete
 from remaster_ros.session.yaml_records import to_plain
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.setup import make_world

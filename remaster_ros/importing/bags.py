@@ -29,8 +29,8 @@ from remaster_ros.importing.standstills import (
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import mean_quaternion_xyzw
-from remaster_ros.session.bag import BagReader, jazzy_types
-from remaster_ros.session.observations import LENGTH_TOLERANCE
+from remaster_ros.session.bags.bag import BagReader, jazzy_types
+from remaster_ros.session.records.observations import LENGTH_TOLERANCE
 from remaster_ros.types import FARTHEST_M, FloatArray
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'

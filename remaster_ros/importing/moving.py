@@ -38,7 +38,7 @@ from remaster_ros.importing.joint_motion import JointMotion
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, inverse
-from remaster_ros.session.observations import stacked
+from remaster_ros.session.records.observations import stacked
 from remaster_ros.types import (
     AccuracyOption,
     BoolArray,

@@ -43,7 +43,7 @@ from remaster_ros.importing.values import (
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.observations import LENGTH_TOLERANCE
+from remaster_ros.session.records.observations import LENGTH_TOLERANCE
 from remaster_ros.types import AngleUnit, BoolArray, FloatArray, IntArray, SensorKind
 
 # Criterion by which rows of joints and rows of points are paired; '' for the first that works.

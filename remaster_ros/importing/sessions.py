@@ -12,7 +12,7 @@ import numpy as np
 from remaster_ros.calibration.arrangement import Arrangement, arranged
 from remaster_ros.errors import InputError, did_you_mean
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import all_rows
+from remaster_ros.session.records.reader import all_rows
 from remaster_ros.types import Controller, PadJoint, Session
 
 QUARTER_DEG = 90.0

@@ -20,8 +20,8 @@ from std_msgs.msg import String
 from remaster_ros.collection.events import EventRecord, RecorderBegan, encode
 from remaster_ros.errors import DiskError, InputError
 from remaster_ros.nodes.status import EVENTS, LATCHED, TOPIC
-from remaster_ros.session.bag import RECORDED
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag import RECORDED
+from remaster_ros.session.bags.bag_writer import BagWriter
 
 DEEP = QoSProfile(depth=2000, reliability=ReliabilityPolicy.RELIABLE)
 """Queue of a busy recorder: seconds of the fastest stream."""

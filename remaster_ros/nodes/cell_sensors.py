@@ -22,11 +22,11 @@ from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.measure_services import TriggeredSensors
 from remaster_ros.nodes.running import RemasterNode
 from remaster_ros.nodes.simulated_clock import SteadyTime
+from remaster_ros.session.cells.workcell import Workcell
 from remaster_ros.session.session_recorder import (
     Parameters,
     SessionRecorder,
 )
-from remaster_ros.session.workcell import Workcell
 
 
 class CellSensors:

@@ -26,7 +26,7 @@ from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.simulated_clock import LEADS, TAKEN, TAKEN_EVERY_S
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.setup import (

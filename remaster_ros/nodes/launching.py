@@ -14,9 +14,9 @@ from typing import Any
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.registry import DRIVERS, GENERIC, TOPIC, kind_of
+from remaster_ros.session.cells.workcell import YAML_LIMIT, read_cell
 from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.session.strict_yaml import YamlError, load_yaml
-from remaster_ros.session.workcell import YAML_LIMIT, read_cell
 
 CORE = ('pose_planner', 'robot_bridge', 'recorder', 'optimizer')
 SENSORS = ('optitrack_markers', 'laser_tracker_markers')

@@ -12,7 +12,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from remaster_ros.collection.pairing import Pairing
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
 
 PATIENCE_WALL_S = 1.0
 """Time from an answer until it counts: meanwhile the reading arrives, or the status of the node

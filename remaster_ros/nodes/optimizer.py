@@ -52,9 +52,9 @@ from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
 from remaster_ros.reports.loadable import uncertainty
 from remaster_ros.reports.precision_json import precision_json
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
-from remaster_ros.session.priors_file import read_priors
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.priors_file import read_priors
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import FloatArray, Priors
 
 

@@ -67,8 +67,8 @@ from remaster_ros.nodes.status import (
 )
 from remaster_ros.planning.collection_plan import session_time_s
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit, Tour
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.plan_journal import PlanJournal
 from remaster_ros.types import FloatArray
 
 RETRY_WALL_S = 1.0

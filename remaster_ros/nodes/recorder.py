@@ -46,13 +46,13 @@ from remaster_ros.nodes.status import (
     receiver,
     taken_key,
 )
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.session_recorder import (
     Outlet,
     Parameters,
     SessionRecorder,
     session_header,
 )
-from remaster_ros.session.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 

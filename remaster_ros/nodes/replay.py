@@ -33,7 +33,7 @@ from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.status import EVENTS, MESSAGES_TAKEN, node_of, taken_key
 from remaster_ros.nodes.status import TOPIC as STATUS
-from remaster_ros.session.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
+from remaster_ros.session.bags.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 
 CLOCK = '/clock'
 COMMANDS = '/joint_trajectory_controller/joint_trajectory'

@@ -82,7 +82,7 @@ from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
 from remaster_ros.parameters import SimulationParameters
 from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
-from remaster_ros.session.workcell import Workcell, read_cell
+from remaster_ros.session.cells.workcell import Workcell, read_cell
 from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:

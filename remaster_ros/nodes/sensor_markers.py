@@ -44,7 +44,7 @@ from remaster_ros.sensors.driver import SensorClock, StreamDriver, TriggeredDriv
 from remaster_ros.sensors.driver import SensorParameters as Parameters
 from remaster_ros.sensors.registry import GENERIC, TOPIC, kind_of, load_driver
 from remaster_ros.sensors.topic.driver import TopicDriver
-from remaster_ros.session.workcell import CellSensor, Workcell, read_cell
+from remaster_ros.session.cells.workcell import CellSensor, Workcell, read_cell
 from remaster_ros.types import FloatArray, MarkerReading
 
 __all__ = ['Parameters', 'SensorNode', 'main', 'run_sensor']

@@ -11,8 +11,8 @@ from remaster_ros.collection.events import RecorderBegan
 from remaster_ros.errors import DiskError, MovedError
 from remaster_ros.nodes.bagging import BagRecorder
 from remaster_ros.nodes.running import RemasterNode
-from remaster_ros.session.session_journal import SessionJournal
-from remaster_ros.session.session_yaml import ExitStatus
+from remaster_ros.session.records.session_journal import SessionJournal
+from remaster_ros.session.records.session_yaml import ExitStatus
 from remaster_ros.types import Session
 
 RETRY_S = 1.0

@@ -35,7 +35,7 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.errors import InputError
 from remaster_ros.motion.rivalry import DuplicateNodeCheck
-from remaster_ros.session.bag_metadata import LATCHED_DEPTH
+from remaster_ros.session.bags.bag_metadata import LATCHED_DEPTH
 
 UNNAMED = '_NODE_NAME_UNKNOWN_'
 """What rmw calls a node whose name it has not received yet; its endpoints may be known before."""

@@ -55,7 +55,7 @@ from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer
 from remaster_ros.reports.live_view import FitFacts, LiveView, PlanPage
 from remaster_ros.reports.plan_page import read_plan_page
 from remaster_ros.reports.robot_scene import robot_scene, scene_to_dict
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -63,7 +63,7 @@ from remaster_ros.session.files import decode_text, read_limited
 from remaster_ros.types import BoolArray, FloatArray, Session
 
 if TYPE_CHECKING:
-    from remaster_ros.session.plan_journal import RecordedPlan
+    from remaster_ros.session.records.plan_journal import RecordedPlan
 
 # Inputs: a session, its fit, and its discovery if any.
 

@@ -65,7 +65,7 @@ from remaster_ros.types import FloatArray, IntArray, Session
 if TYPE_CHECKING:
     from remaster_ros.calibration.result import FitResult
     from remaster_ros.discovery.discover import Discovery
-    from remaster_ros.session.plan_journal import RecordedPlan
+    from remaster_ros.session.records.plan_journal import RecordedPlan
 
 
 # The 3-D view of a fit: arm, measured markers, magnified error vectors, sensors.

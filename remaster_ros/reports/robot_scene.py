@@ -26,8 +26,8 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.kinematics.urdf_geometry import Visual, chain_visuals
 from remaster_ros.planning.candidates import LineOfSight, PlanningScene
-from remaster_ros.session.meshes import MeshPart, find_mesh, read_mesh_parts
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.meshes import MeshPart, find_mesh, read_mesh_parts
+from remaster_ros.session.cells.workcell import Workcell
 from remaster_ros.types import FloatArray, IntArray
 
 Color = tuple[float, float, float]

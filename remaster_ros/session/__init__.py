@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files: sessions, journals, bags, workcells."""
+"""Files: sessions, bags and workcells, a folder each; here what they share and what joins them."""

@@ -22,18 +22,18 @@ from remaster_ros.collection import events
 from remaster_ros.collection.message_fields import temperature_topic
 from remaster_ros.errors import InputError
 from remaster_ros.parameters import check_all
-from remaster_ros.session.bag import BagReader, live_name
+from remaster_ros.session.bags.bag import BagReader, live_name
+from remaster_ros.session.cells.workcell import Workcell
 from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
-from remaster_ros.session.session_journal import SessionJournal
+from remaster_ros.session.records.reader import HEADER, OBSERVATIONS_LIMIT, ROWS
+from remaster_ros.session.records.session_journal import SessionJournal
+from remaster_ros.session.records.session_yaml import ExitStatus
 from remaster_ros.session.session_recorder import (
     Outlet,
     Parameters,
     SessionRecorder,
     session_header,
 )
-from remaster_ros.session.session_yaml import ExitStatus
-from remaster_ros.session.workcell import Workcell
 
 log = logging.getLogger('remaster_ros')
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag_writer import recover_bag
-from remaster_ros.session.journal import Journal
+from remaster_ros.session.bags.bag_writer import recover_bag
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.reader import JOURNAL, PLAN, read_header, read_robot
-from remaster_ros.session.session_writer import SessionWriter
-from remaster_ros.session.session_yaml import SessionHeader
+from remaster_ros.session.records.journal import Journal
+from remaster_ros.session.records.reader import JOURNAL, PLAN, read_header, read_robot
+from remaster_ros.session.records.session_writer import SessionWriter
+from remaster_ros.session.records.session_yaml import SessionHeader
 from remaster_ros.types import Measurements
 
 

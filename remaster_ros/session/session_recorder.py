@@ -38,9 +38,9 @@ from remaster_ros.errors import InputError
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.parameters import SimulationParameters, parameter
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
-from remaster_ros.session.session_journal import SessionJournal
-from remaster_ros.session.session_yaml import ExitStatus
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
+from remaster_ros.session.records.session_journal import SessionJournal
+from remaster_ros.session.records.session_yaml import ExitStatus
 from remaster_ros.types import (
     BRIDGE,
     Correction,

@@ -15,7 +15,7 @@ import yaml
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.workcell import Workcell, config_path
+from remaster_ros.session.cells.workcell import Workcell, config_path
 from remaster_ros.simulation.dynamics import Dynamics
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import model_of_tour

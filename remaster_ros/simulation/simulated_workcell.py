@@ -16,9 +16,9 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.planned_design import designed_plans
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.travel_time import TravelTime
+from remaster_ros.session.cells.workcell import CellRobot, Workcell, config_path
 from remaster_ros.session.files import decode_text, read_limited
-from remaster_ros.session.reader import URDF_LIMIT
-from remaster_ros.session.workcell import CellRobot, Workcell, config_path
+from remaster_ros.session.records.reader import URDF_LIMIT
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
 from remaster_ros.simulation.hidden_arm import SECONDS_PER_CONFIGURATION, model_of_tour
 from remaster_ros.simulation.truth import (

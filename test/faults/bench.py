@@ -26,8 +26,8 @@ from rigs.ros_rig import ASKED, PATIENCE
 
 from remaster_ros.collection.events import ConfigurationEnded, PoseAnnounced, SolutionSettled
 from remaster_ros.demo.processes import free_ports
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.workcell import config_path, read_cell
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.setup import make_world
 

@@ -14,11 +14,11 @@ import numpy as np
 from faults.crash_states import Operation, Recorder, crash_state, materialise
 
 from remaster_ros.errors import InputError
-from remaster_ros.session import session_yaml
-from remaster_ros.session.journal import Journal
-from remaster_ros.session.reader import PLAN, read_session
+from remaster_ros.session.records import session_yaml
+from remaster_ros.session.records.journal import Journal
+from remaster_ros.session.records.reader import PLAN, read_session
+from remaster_ros.session.records.session_writer import SessionWriter
 from remaster_ros.session.recovery import recover_session
-from remaster_ros.session.session_writer import SessionWriter
 from remaster_ros.session.strict_yaml import load_yaml
 from remaster_ros.types import Correction, Measurements, Observation, Session
 

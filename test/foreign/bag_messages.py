@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 START_NS = 1_700_000_000_000_000_000

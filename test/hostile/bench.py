@@ -57,7 +57,7 @@ from remaster_ros.collection.events import (
     encode,
 )
 from remaster_ros.session.bridge_files import HaltFile, LastCommandFile
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 

@@ -14,7 +14,7 @@ from hostile.judge import Body, Rules
 from hostile.process import environment
 
 from remaster_ros.motion.spline import Spline
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray
 
 HOME = np.array([0.0, 0.3, 0.0, 1.0, 0.0, 0.5, 0.0])

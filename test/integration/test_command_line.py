@@ -26,7 +26,7 @@ from remaster_ros.kinematics.transforms import (
     matrix_from_quaternion_xyzw,
     transform,
 )
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import Session
 
 DATA = ROOT.parent / 'shared/data'

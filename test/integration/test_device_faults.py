@@ -25,7 +25,7 @@ from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
 from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.setup import make_world

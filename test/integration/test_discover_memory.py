@@ -15,7 +15,7 @@ from rigs.command_line import ROOT
 from worlds.calibration_scenes import CHAIN, MARKERS, URDF, sensors
 
 from remaster_ros.reports.discovery_json import read_discovery
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.simulation.simulated_workcell import simulate_session
 
 # The command with a search of few rows, so that what all rows take is what counts; then the

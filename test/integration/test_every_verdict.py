@@ -17,7 +17,7 @@ import pytest
 from rigs.command_line import refusal, remaster, run
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Session
 
 SIZE = ('--validation', 8, '--sensors', 'mocap', '--quiet')

@@ -13,8 +13,8 @@ from remaster_ros.discovery.discover import discover_session
 from remaster_ros.planning.expected_sensors import ExpectedSensor
 from remaster_ros.reports.fit_json import read_fit
 from remaster_ros.reports.result_folder import save_fit
-from remaster_ros.session.reader import read_session, write_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.reader import read_session, write_session
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

@@ -18,7 +18,7 @@ from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InsufficientDataError, MisfitError, MistakeFoundError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.urdf import parse_urdf
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Measurements, Session
 
 DATA = Path(__file__).parents[3] / 'shared/data'

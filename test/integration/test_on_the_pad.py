@@ -22,7 +22,7 @@ from worlds.robot_descriptions import ROBOTS
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import apply, rotation_vector_to_matrix, transform
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 CASES = Path(__file__).parents[3] / 'shared' / 'cases'
 ROWS, NOISE_M = 36, 3e-5

@@ -18,7 +18,7 @@ from remaster_ros.reports.discovery_json import predictions_of, read_discovery
 from remaster_ros.reports.loadable import compensation_of, compensation_text, geometry_of
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.reports.sentences import load_words
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import Session
 
 DATA = Path(__file__).parents[3] / 'shared/data'

@@ -10,8 +10,8 @@ from rigs.command_line import refusal, remaster
 from worlds.recorded_bags import CHAIN, RecordedArm
 
 from remaster_ros.collection.events import BridgeState, ReadByHand
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import Correction
 
 SEED = 7

@@ -10,7 +10,7 @@ from rigs.command_line import refusal, run
 import remaster_ros
 from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.errors import InputError
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 CASES = Path(__file__).parents[3] / 'shared' / 'cases'
 SECOND = CASES / 'second'

@@ -11,8 +11,8 @@ import pytest
 from rigs.command_line import refusal, remaster
 from worlds.session_shapes import CHEAP, LARGE, LAST_ALONE, observations, one_pose_for_all
 
-from remaster_ros.session.reader import read_session, write_session
-from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.records.reader import read_session, write_session
+from remaster_ros.session.records.session_writer import SessionWriter
 
 # Every append waits for the disk.
 MOST_RECORDED = 300

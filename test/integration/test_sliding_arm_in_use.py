@@ -16,7 +16,7 @@ from worlds.measured_rows import measured_rows
 
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Session
 
 pin = pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from rigs.command_line import ROOT, remaster
 
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Session
 
 CASES = ROOT.parent / 'shared' / 'cases'

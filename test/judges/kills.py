@@ -13,8 +13,8 @@ import yaml
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.session.yaml_records import from_plain
 from remaster_ros.simulation.truth import SessionTruth
 

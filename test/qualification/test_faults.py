@@ -13,8 +13,8 @@ import pytest
 from rigs.ros_rig import call, clear_halt, wait_until
 
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.setup import make_world
 

@@ -14,7 +14,7 @@ import yaml
 from judges.kills import judge, node_processes
 from rigs.ros_rig import wait_until
 
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]

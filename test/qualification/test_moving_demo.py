@@ -17,9 +17,9 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.qualify, pytest.mark.timeout(1200)]
 

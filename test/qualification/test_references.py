@@ -10,8 +10,8 @@ from rigs.collection_rig import Cell
 from rigs.ros_rig import call
 
 from remaster_ros.collection.events import SetupChanged
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(400)]

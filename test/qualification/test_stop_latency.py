@@ -8,7 +8,7 @@ import pytest
 from rigs.ros_rig import node_arguments
 
 from remaster_ros.collection.events import BridgeState, RecorderState, SensorReport
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(200)]
 
@@ -18,7 +18,7 @@ import os, sys, time
 seconds, sys.argv = float(sys.argv[1]), sys.argv[1:]
 from remaster_ros.nodes import pose_planner
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.session import journal
+from remaster_ros.session.records import journal
 append = journal.Journal.append
 def slow_append(self, record):
     print('writing', flush=True)

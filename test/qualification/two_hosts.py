@@ -32,8 +32,8 @@ import numpy as np
 
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.nodes.simulated_clock import TAKEN
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.workcell import config_path, read_cell
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.world import MOTION_FILE, World
 

@@ -10,10 +10,10 @@ from rigs.ros_rig import ROOT, call, node_arguments, wait_until
 from remaster_ros.collection.events import ConfigurationEnded
 from remaster_ros.demo.processes import free_ports
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.plan_journal import read_plan
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.plan_journal import read_plan
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.setup import make_world
 
 SEED = 11

@@ -37,6 +37,9 @@ CORE = (
     'discovery',
     'sensors',
     'session',
+    'session.bags',
+    'session.cells',
+    'session.records',
     'simulation',
 )
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
@@ -141,7 +144,7 @@ def main() -> None:
     tests = socket.socket(fileno=int(sys.argv[1]))
     # Not rclpy, whose import begins threads.
     for name in CORE:
-        folder = ROOT / 'remaster_ros' / name
+        folder = ROOT.joinpath('remaster_ros', *name.split('.'))
         for path in sorted(folder.glob('[a-z]*.py')):
             importlib.import_module(f'remaster_ros.{name}.{path.stem}')
     assert len(os.listdir('/proc/self/task')) == 1, 'threads do not survive a fork'

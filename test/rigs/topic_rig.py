@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros import fit
 from remaster_ros.collection.events import ConfigurationEnded
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 
 POINT, POSE = 'geometry_msgs/msg/PointStamped', 'geometry_msgs/msg/PoseStamped'

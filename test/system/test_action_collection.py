@@ -14,7 +14,7 @@ from rigs.collection_rig import Cell
 from rigs.ros_rig import call
 
 from remaster_ros.nodes.controller_link import COPIES
-from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bags.bag import BagReader
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

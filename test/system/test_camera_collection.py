@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros import fit
 from remaster_ros.kinematics.transforms import inverse_poses
-from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_replay import differences, record_from_bag
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.cells.workcell import config_path, read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -12,7 +12,7 @@ from rigs.ros_rig import call
 from worlds.compensation_files import save
 
 from remaster_ros.compensation.arm_model import ArmModel
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(600)]

@@ -17,7 +17,7 @@ from remaster_ros.cli.verify import visits
 from remaster_ros.compensation.arm_model import ArmModel
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.compensation.verification import verify
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.types import Correction
 

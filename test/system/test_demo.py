@@ -18,8 +18,8 @@ from rigs.ros_rig import ROOT, call, node_arguments, wait_until
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.settling import SettleRules
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.session.yaml_records import from_plain
 from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.types import Correction

@@ -8,8 +8,8 @@ from rigs.collection_rig import Cell
 from remaster_ros.collection.events import PoseAnnounced, TourPlanned
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.pose_design import Floors
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
+from remaster_ros.session.records.journal import read_journal
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -22,8 +22,8 @@ from remaster_ros.collection.events import (
     RecorderState,
     encode,
 )
-from remaster_ros.session.reader import write_session
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
+from remaster_ros.session.records.reader import write_session
 
 pytestmark = pytest.mark.ros
 SEED = 21

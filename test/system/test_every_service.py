@@ -8,7 +8,7 @@ import pytest
 from rigs.command_line import remaster
 from rigs.ros_rig import call, found, node_arguments, wait_until
 
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

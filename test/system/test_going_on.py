@@ -15,9 +15,9 @@ from remaster_ros.collection.events import (
     PoseAnnounced,
     encode,
 )
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

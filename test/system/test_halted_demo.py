@@ -10,7 +10,7 @@ import threading
 import pytest
 from rigs.ros_rig import wait_until
 
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.faults import inject
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

@@ -22,7 +22,7 @@ from hostile.scene import demo_body
 
 from remaster_ros.demo.processes import free_ports
 from remaster_ros.session.bridge_files import LastCommandFile
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

@@ -39,7 +39,7 @@ ASK = """
 import json
 from ament_index_python.packages import get_package_prefix, get_package_share_directory
 import remaster_ros
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.workcell import config_path, read_cell
 read_cell('demo')
 print(json.dumps({
     'prefix': get_package_prefix('remaster_ros'),

@@ -9,9 +9,9 @@ from rigs.ros_rig import call, node_arguments
 
 from remaster_ros.collection.events import TourPlanned
 from remaster_ros.planning.separating_design import MOST_ADDED
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

@@ -126,7 +126,7 @@ def test_a_demo_that_is_refused_or_stopped_before_its_session_does_not_block_the
 
 @pytest.mark.parametrize('fake', ['fake_optitrack', 'fake_laser_tracker'])
 def test_a_port_in_use(start, tmp_path, fake):
-    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.session.cells.workcell import read_cell
     from remaster_ros.simulation.setup import make_world
 
     make_world(tmp_path / 'world', read_cell('demo'), seed=1, rate=1.0).close()

@@ -4,7 +4,7 @@
 import pytest
 from rigs.ros_rig import node_arguments, wait_until
 
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

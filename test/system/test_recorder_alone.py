@@ -26,7 +26,7 @@ from remaster_ros.kinematics.transforms import (
     rotation_vector_to_matrix,
     transform,
 )
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

@@ -10,10 +10,10 @@ import pytest
 from rigs.ros_rig import node_arguments, wait_until
 from worlds.recorded_bags import RecordedArm
 
-from remaster_ros.session.bag import BagReader
 from remaster_ros.session.bag_replay import differences, record_from_bag
-from remaster_ros.session.bag_writer import BagWriter
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.bags.bag_writer import BagWriter
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

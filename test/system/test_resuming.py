@@ -110,7 +110,7 @@ def test_a_halted_arm_is_not_collected_with(start, client, tmp_path):
     from sensor_msgs.msg import JointState
 
     from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
-    from remaster_ros.session.workcell import read_cell
+    from remaster_ros.session.cells.workcell import read_cell
 
     halted = 'the robot does not follow'
     bridge = rclpy.create_node('robot_bridge', context=client.context)

@@ -19,7 +19,7 @@ from worlds.compensation_files import arm, save
 from worlds.simple_cells import write_cell
 
 from remaster_ros.collection.events import SolutionFailed
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

@@ -11,9 +11,9 @@ import pytest
 import yaml
 from rigs.ros_rig import node_arguments, wait_until
 
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.bag_writer import BagWriter
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.bags.bag_writer import BagWriter
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]
 

@@ -6,7 +6,7 @@ import pytest
 from rigs.collection_rig import Cell
 
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 from remaster_ros.simulation.faults import inject
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

@@ -13,8 +13,8 @@ import yaml
 from rigs.ros_rig import call, node_arguments, wait_until
 
 from remaster_ros.demo.processes import free_ports
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(900)]

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from rigs.ros_rig import PATIENCE, wait_until
 
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 LIMIT_S = 5.0 * PATIENCE
 

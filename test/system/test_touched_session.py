@@ -8,7 +8,7 @@ import time
 import pytest
 from rigs.collection_rig import Cell
 
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 

@@ -10,8 +10,8 @@ from rigs.ros_rig import ROOT, call, wait_until
 
 from remaster_ros.demo.processes import free_ports
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.world import World
 
 pytestmark = [pytest.mark.qualify, pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]

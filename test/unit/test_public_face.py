@@ -15,7 +15,7 @@ from worlds.arms import jointed_arm
 
 import remaster_ros
 from remaster_ros.errors import MisfitError, MistakeFoundError
-from remaster_ros.session.observations import column_names
+from remaster_ros.session.records.observations import column_names
 
 ROOT = Path(__file__).parents[2]
 FUNCTIONS = [name for name in remaster_ros.__all__ if name != '__version__']

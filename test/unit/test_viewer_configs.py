@@ -19,7 +19,7 @@ from judges.viewer_configs import (
 )
 from rigs.command_line import refusal, remaster
 
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.workcell import config_path, read_cell
 
 
 def assert_displays(manager):

@@ -18,8 +18,8 @@ from worlds.moving_world import (
 
 from remaster_ros.importing.moving import MarkerStream, MovingOptions, moving_session
 from remaster_ros.importing.standstills import Stream, joint_standstills
-from remaster_ros.session.bag_writer import BagWriter
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.bags.bag_writer import BagWriter
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import Measurements, Session
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

@@ -17,7 +17,7 @@ import yaml
 from judges.paths import BulletJudge, FclJudge, Judge, Part
 
 from remaster_ros.kinematics.transforms import matrix_from_rpy, transform
-from remaster_ros.session.workcell import Workcell, config_path, read_cell
+from remaster_ros.session.cells.workcell import Workcell, config_path, read_cell
 from remaster_ros.types import FloatArray
 
 # Where each arm's wrist reaches with the tool level.

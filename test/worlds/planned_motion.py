@@ -11,7 +11,7 @@ from worlds.moving_bags import imported
 from worlds.moving_world import Dynamics, Errors, MovingWorld, Recording
 
 from remaster_ros.motion.trajectory import RAMP_S, Curve
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
 from remaster_ros.types import FloatArray, Session
 
 REST_S = 3.5

@@ -8,7 +8,7 @@ import numpy as np
 from remaster_ros.collection import events
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_from_rpy, transform
 from remaster_ros.reports.live_view import FitFacts, LiveView
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

@@ -12,9 +12,9 @@ from rosbags.typesys import Stores, get_typestore
 from remaster_ros.collection import events
 from remaster_ros.collection.message_fields import WANTED
 from remaster_ros.kinematics.transforms import apply, inverse, transform
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.session_recorder import Parameters
-from remaster_ros.session.workcell import read_cell
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'

@@ -11,7 +11,7 @@ import numpy as np
 from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensors
 
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.simulated_workcell import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import Observation, Session

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import yaml
 
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 
 DEMO = config_path('cells/demo.yaml').read_text(encoding='utf-8')
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from worlds.simple_cells import write_cell
 
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 
 LWR = config_path('robots/lwr4plus.urdf').read_text(encoding='utf-8')
 

@@ -12,7 +12,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.expected_sensors import ExpectedSensor
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray, IntArray
 
 POSES, SOLUTIONS = 30, 2

@@ -18,8 +18,8 @@ from remaster_ros.planning.separating_design import MOST_ADDED
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.reader import OBSERVATIONS_LIMIT, ROWS, read_session
+from remaster_ros.session.records.plan_journal import PlanJournal
+from remaster_ros.session.records.reader import OBSERVATIONS_LIMIT, ROWS, read_session
 from remaster_ros.types import FloatArray
 
 DISCOVER = '/remaster/discover'

@@ -29,7 +29,7 @@ from remaster_ros.nodes.parameters import parameter
 from remaster_ros.nodes.status import LATCHED
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
 
 Inspection = Literal['verify', 'check']
 KINDS: tuple[Inspection, ...] = ('verify', 'check')

@@ -22,7 +22,7 @@ from remaster_ros.planning.rival_causes import FoundCause
 from remaster_ros.planning.tour_order import REGISTRATION
 from remaster_ros.planning.tour_planner import REGISTRATION_CANDIDATES, TourPlanner
 from remaster_ros.planning.travel_time import SPEED_SHARE, TravelTime
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from remaster_ros.nodes.background import Background, PlanningThread
 from remaster_ros.planning.collection_plan import look_ahead
 from remaster_ros.planning.tour_order import REGISTRATION, PoseVisit, Tour
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.session.plan_journal import plan_page_path
-from remaster_ros.session.workcell import Workcell
+from remaster_ros.session.cells.workcell import Workcell
+from remaster_ros.session.records.plan_journal import plan_page_path
 from remaster_ros.types import FloatArray
 
 

@@ -15,7 +15,7 @@ from remaster_ros.compensation.export import calibrated_urdf
 from remaster_ros.compensation.mastering import mastering
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import Priors
 
 pin = pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')

@@ -19,8 +19,8 @@ from rigs.command_line import refusal, remaster, run
 from remaster_ros.cli import batch
 from remaster_ros.errors import InputError
 from remaster_ros.reports.batch_page import summary_of, write_batch_page
-from remaster_ros.session.journal import read_journal
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.journal import read_journal
+from remaster_ros.session.records.reader import read_session
 
 
 def rows(folder: Path) -> dict[str, dict]:

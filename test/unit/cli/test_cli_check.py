@@ -17,7 +17,7 @@ from worlds.measured_rows import measured_rows
 
 from remaster_ros.compensation.checking import Measured
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.types import Session
 
 

@@ -25,7 +25,7 @@ import pinocchio
 
 from remaster_ros.compensation.arm_model import Function, Geometry, JointTerm
 from remaster_ros.compensation.file import read_compensation
-from remaster_ros.session.robot_description import read_description
+from remaster_ros.session.cells.robot_description import read_description
 from remaster_ros.types import Controller, PadJoint
 
 UR = ROBOTS['ur5e']()

@@ -18,7 +18,7 @@ from remaster_ros.compensation.export import calibrated_urdf
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning import planned_design, pose_design
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CASES = Path(__file__).parents[4] / 'shared' / 'cases'
 XACRO = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'

@@ -14,7 +14,7 @@ from worlds.verified_arms import Case, found_arm, measured
 
 from remaster_ros.cli.verify import WORDS
 from remaster_ros.compensation.file import read_compensation
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 from remaster_ros.types import Correction, Session
 
 CASE = Case(11, 0.2, 0.1, 'in_use', toggled=True)

@@ -16,7 +16,7 @@ import remaster_ros
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 
 
 def pose(values):

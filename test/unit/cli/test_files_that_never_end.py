@@ -82,7 +82,7 @@ def test_a_pipe_as_history_is_refused_before_anything_is_written(tmp_path, capsy
     os.mkfifo(tmp_path / 'history.jsonl')
     from remaster_ros.cli.check import _require_history
     from remaster_ros.errors import InputError
-    from remaster_ros.session.journal import Journal
+    from remaster_ros.session.records.journal import Journal
 
     with pytest.raises(InputError, match='not a regular file'):
         _require_history(tmp_path / 'history.jsonl')

@@ -8,8 +8,8 @@ import pytest
 from faults.session_crashes import live, make_observations, session_header
 from rigs.command_line import refusal, remaster
 
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.records.reader import read_session
+from remaster_ros.session.records.session_writer import SessionWriter
 
 
 @pytest.fixture

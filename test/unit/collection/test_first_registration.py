@@ -8,7 +8,7 @@ import numpy as np
 from remaster_ros.collection.first_registration import FirstRegistration
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.kinematics.transforms import apply, inverse, rotation_vector_to_matrix, transform
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
 MARKERS = {'sir': np.array([0.1, 0.0, 0.0])}

@@ -8,7 +8,7 @@ import pytest
 
 from remaster_ros.collection.live_residuals import FEWEST, LiveResiduals
 from remaster_ros.kinematics.transforms import apply, inverse, matrix_from_rpy, transform
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

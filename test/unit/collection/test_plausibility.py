@@ -10,7 +10,7 @@ from remaster_ros.collection.pairing import PairedReading, Rejection
 from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

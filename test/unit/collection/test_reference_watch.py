@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from remaster_ros.collection.reference_watch import ReferenceReading, ReferenceWatch, replay
 from remaster_ros.kinematics import transforms
 from remaster_ros.planning.reference_choice import choose_references
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

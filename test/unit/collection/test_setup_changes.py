@@ -10,7 +10,7 @@ import pytest
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.reference_watch import SetupChanges
 from remaster_ros.kinematics import transforms
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

@@ -21,7 +21,7 @@ from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.planning.reference_choice import Place, causes
 from remaster_ros.reports.live_view import LiveView
 from remaster_ros.reports.precision_json import precision_json
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.robot import ENCODER_RAD, REPEATABILITY_RAD, FakeArm

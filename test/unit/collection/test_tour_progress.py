@@ -13,9 +13,9 @@ from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION, Tour
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.session_journal import Outcomes
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.plan_journal import PlanJournal
+from remaster_ros.session.records.session_journal import Outcomes
 
 CHAIN = read_cell('demo').chain()
 Q = np.zeros(len(CHAIN))

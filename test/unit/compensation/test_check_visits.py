@@ -9,7 +9,7 @@ from remaster_ros.compensation.check_visits import CHECK_POSES, chosen_visits, r
 from remaster_ros.errors import InputError
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

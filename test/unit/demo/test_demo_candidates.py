@@ -6,7 +6,7 @@ import pytest
 
 from remaster_ros.demo.demo import TO_FIT, enough_candidates
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 
 @pytest.mark.parametrize('asked', [1, 5])

@@ -15,7 +15,7 @@ from remaster_ros.cli.main import main
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS, MOTION
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.session.reader import write_session
+from remaster_ros.session.records.reader import write_session
 
 STEP_S = 1e-4
 SEED = 5

@@ -10,7 +10,7 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.errors import InputError
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 
 
 def session_of(kind):

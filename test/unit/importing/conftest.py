@@ -4,7 +4,7 @@
 import pytest
 from rigs.command_line import remaster
 
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 
 @pytest.fixture

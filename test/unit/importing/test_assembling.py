@@ -11,7 +11,7 @@ from rigs.command_line import remaster, run
 from remaster_ros.errors import InputError
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 DATA = Path(__file__).parents[4] / 'shared' / 'data'
 

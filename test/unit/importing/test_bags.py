@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from remaster_ros.errors import InputError
 from remaster_ros.importing.bags import is_bag, read_bag
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'

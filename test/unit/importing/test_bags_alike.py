@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from remaster_ros.importing.bags import read_bag
 from remaster_ros.importing.rows import TableOptions, read_rows
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 
 JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
 CALIBRATION = 'robot_calibration_msgs/msg/CalibrationData'

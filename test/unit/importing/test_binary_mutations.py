@@ -15,7 +15,7 @@ from test_makers import mutated
 from remaster_ros.errors import InputError
 from remaster_ros.importing.bags import read_bag
 from remaster_ros.importing.rows import TableOptions, read_rows
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 from remaster_ros.types import FARTHEST_M
 
 COUNTS = pytest.mark.parametrize(

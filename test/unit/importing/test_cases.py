@@ -8,7 +8,7 @@ import pytest
 from rigs.command_line import run
 
 from remaster_ros.calibration.estimate import Problem, estimate
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 CASES = Path(__file__).parents[4] / 'shared' / 'cases'
 pytestmark = pytest.mark.skipif(

@@ -9,7 +9,7 @@ from foreign.tables import MARKER, measured, text, write
 from rigs.command_line import remaster
 
 from remaster_ros.calibration.fit import fit_session
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from foreign.tables import measured, text, write
 
 import remaster_ros
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.session.robot_description import read_arm
+from remaster_ros.session.cells.robot_description import read_arm
 
 
 @pytest.fixture

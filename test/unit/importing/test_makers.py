@@ -18,7 +18,7 @@ from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table
 from remaster_ros.importing.units import ANGLES
 from remaster_ros.importing.values import angle_unit, numbers
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
 

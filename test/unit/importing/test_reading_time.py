@@ -21,7 +21,7 @@ from remaster_ros.importing.bags import read_bag
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.journal import format_record, read_journal
+from remaster_ros.session.records.journal import format_record, read_journal
 
 JOINT_STATE, POINT = 'sensor_msgs/msg/JointState', 'geometry_msgs/msg/PointStamped'
 PLANAR_URDF = '<robot name="r"><link name="base"/>' + ''.join(

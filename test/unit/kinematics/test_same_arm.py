@@ -7,7 +7,7 @@ import pytest
 
 from remaster_ros.kinematics.same_arm import difference
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 
 TEXT = config_path('robots/lwr4plus.urdf').read_text(encoding='utf-8')
 CHAIN = SerialChain.from_urdf(TEXT, tip_link='tool')

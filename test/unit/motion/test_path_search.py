@@ -10,7 +10,7 @@ from worlds.simple_cells import write_cell
 from remaster_ros.motion.actions import CheckPath
 from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
 ARM = np.array([0.0, 0.9, 0.0, 1.2, 0.0, 0.3, 0.0])

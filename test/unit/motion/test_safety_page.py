@@ -26,7 +26,7 @@ from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.nodes import robot_bridge
 from remaster_ros.nodes.robot_bridge import Parameters
 from remaster_ros.session import session_recorder
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 PAGE = ' '.join(
     (Path(__file__).parents[3] / 'docs' / 'safety.md').read_text(encoding='utf-8').split()

@@ -35,7 +35,7 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.motion.states import Arm
 from remaster_ros.nodes import rivals, robot_bridge, simulated_clock, status
 from remaster_ros.session.bridge_files import LastCommandFile
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN, MODEL = CELL.chain(), CELL.model()

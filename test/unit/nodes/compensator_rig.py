@@ -25,7 +25,7 @@ from remaster_ros.compensation.arm_model import Geometry
 from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.nodes.compensator import CompensatorNode
 from remaster_ros.nodes.messages import duration_of
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN, URDF = CELL.chain(), CELL.urdf_text

@@ -23,7 +23,7 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.compensation.arm_model import Function, JointTerm
 from remaster_ros.nodes import robot_bridge
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 

@@ -16,7 +16,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.motion.joint_units import TURNING
 from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 

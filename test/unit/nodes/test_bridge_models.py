@@ -12,7 +12,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 
 from remaster_ros.nodes.robot_bridge import WATCH_WALL_S
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 

@@ -16,7 +16,7 @@ from worlds.sliding_cells import lift, rail, scara, sliding_cell
 from remaster_ros.collection.events import ArmHalted, ArmStopped, SolutionFailed
 from remaster_ros.errors import InputError
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

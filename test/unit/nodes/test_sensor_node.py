@@ -25,7 +25,7 @@ from remaster_ros.nodes.status import LATCHED, pairs
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors import registry
 from remaster_ros.sensors.driver import SensorParameters, StreamDriver, TriggeredDriver
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.workcell import config_path, read_cell
 from remaster_ros.types import MarkerReading
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]

@@ -17,7 +17,7 @@ from remaster_ros.collection.message_fields import seconds
 from remaster_ros.errors import InputError
 from remaster_ros.nodes.messages import stamp_of
 from remaster_ros.sensors.registry import GENERIC
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(120)]
 

@@ -20,7 +20,7 @@ from remaster_ros.planning.pose_settings import PoseSettings
 from remaster_ros.planning.tour_order import Tour
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.plan_json import missed_goal, plan_text, plan_to_dict
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ from remaster_ros.planning.expected_sensors import (
     expected_measurements,
     nominal_model,
 )
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import Priors
 
 CELL = read_cell('demo')

@@ -23,7 +23,7 @@ from remaster_ros.planning.moving_information import MotionRows, expected_along
 from remaster_ros.planning.tour_order import FITTED, HELD_OUT
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.planning.travel_time import TravelTime
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 TOOL_SPEED = 0.25
 FEW = 120

@@ -10,7 +10,7 @@ from remaster_ros.planning.design_information import DesignInformation
 from remaster_ros.planning.expected_sensors import ExpectedSensor
 from remaster_ros.planning.pose_design import Floors, Goal, choose
 from remaster_ros.planning.travel_time import TravelTime
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 CHAIN = CELL.chain()

@@ -21,7 +21,7 @@ from remaster_ros.planning.separating_design import (
     scene_with_other_elbows,
     separate,
 )
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import Priors
 
 CELL = read_cell('demo')

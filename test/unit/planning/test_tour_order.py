@@ -22,7 +22,7 @@ from remaster_ros.planning.candidates import (
 )
 from remaster_ros.planning.tour_order import Tour, free_order, nearest_solution
 from remaster_ros.planning.tour_planner import registration_tour
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
 

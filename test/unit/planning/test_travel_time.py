@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from remaster_ros.motion.trajectory import plan_trajectory
 from remaster_ros.planning.travel_time import TravelTime
 from remaster_ros.planning.visit_order import fastest_order
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 CELL = read_cell('demo')
 MODEL = CELL.planning_scene(CELL.chain()).model

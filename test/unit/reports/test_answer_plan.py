@@ -24,7 +24,7 @@ from remaster_ros.reports.report import (
     require_ready,
 )
 from remaster_ros.reports.schemas import Fit, Judgement
-from remaster_ros.session.plan_journal import ExpectationRecord, RecordedPlan
+from remaster_ros.session.records.plan_journal import ExpectationRecord, RecordedPlan
 
 
 @pytest.fixture

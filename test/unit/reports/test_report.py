@@ -163,7 +163,7 @@ def test_without_figures_there_is_no_report_and_none_of_an_earlier_fit(fit_resul
 
 def test_drawing_libraries_are_imported_only_for_a_report():
     script = (
-        'import sys, remaster_ros.reports.fit_json, remaster_ros.session.reader\n'
+        'import sys, remaster_ros.reports.fit_json, remaster_ros.session.records.reader\n'
         "print([m for m in ('matplotlib', 'plotly', 'jinja2', 'mcap') if m in sys.modules])"
     )
     out = subprocess.run(

@@ -9,7 +9,7 @@ from worlds.simple_cells import write_cell
 
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.reports.robot_scene import MOST_TRIANGLES, coarser, robot_scene
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 MARKERS = {'smr': [0.0, 0.0, 0.1]}
 SENSORS = {'tracker': {'marker': 'smr', 'topic': 'at', 'rough_position_m': [2.0, 0.5, 1.0]}}

@@ -18,7 +18,7 @@ from remaster_ros.sensors.topic.driver import (
     Parameters,
     TopicDriver,
 )
-from remaster_ros.session.workcell import MESSAGE_TYPES
+from remaster_ros.session.cells.workcell import MESSAGE_TYPES
 
 PLACE = (0.5, -0.25, 2.0)
 OURS = ('/vrpn', POINT)

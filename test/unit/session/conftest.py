@@ -4,7 +4,7 @@
 import pytest
 from foreign.bag_messages import messages
 
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 
 
 @pytest.fixture

@@ -19,10 +19,10 @@ from rosbags.rosbag2 import Reader, StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.session import bag_writer
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.bag_metadata import LATCHED_DEPTH, METADATA_FILE
-from remaster_ros.session.bag_writer import BagWriter, recover_bag
+from remaster_ros.session.bags import bag_writer
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.bags.bag_metadata import LATCHED_DEPTH, METADATA_FILE
+from remaster_ros.session.bags.bag_writer import BagWriter, recover_bag
 from remaster_ros.session.manifest import MANIFEST
 
 
@@ -119,7 +119,7 @@ KILLED = """
 import sys
 sys.path.insert(0, {tests!r})
 from foreign.bag_messages import messages
-from remaster_ros.session.bag_writer import BagWriter
+from remaster_ros.session.bags.bag_writer import BagWriter
 writer = BagWriter({folder!r})
 for i, message in enumerate(messages()):
     writer.write(*message)

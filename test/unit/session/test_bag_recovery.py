@@ -11,9 +11,9 @@ from foreign.bag_messages import abandon, messages, part
 from rosbags.rosbag2 import Reader
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.bag_metadata import METADATA_FILE
-from remaster_ros.session.bag_writer import BagWriter, recover_bag
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.bags.bag_metadata import METADATA_FILE
+from remaster_ros.session.bags.bag_writer import BagWriter, recover_bag
 from remaster_ros.session.manifest import MANIFEST
 
 

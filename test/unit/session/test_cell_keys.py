@@ -6,7 +6,7 @@ from worlds.simple_cells import DEMO, edited_cell
 
 from remaster_ros.collection.stopping_rule import StoppingGoal
 from remaster_ros.errors import InputError
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 HYPERCUBE = '  design: latin_hypercube\n'
 TOPIC = '    topic: optitrack/marker'

@@ -11,8 +11,8 @@ import zstandard
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag import BagReader
-from remaster_ros.session.mcap_records import CHUNK_LIMIT
+from remaster_ros.session.bags.bag import BagReader
+from remaster_ros.session.bags.mcap_records import CHUNK_LIMIT
 
 REALLY = 3 * 1024**3
 """What a bomb unpacks to, bytes."""
@@ -21,7 +21,7 @@ READ = """
 import re, sys
 from pathlib import Path
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag import BagReader
+from remaster_ros.session.bags.bag import BagReader
 try:
     BagReader(sys.argv[1])
 except InputError as error:

@@ -8,7 +8,7 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.pad_angles import PadAngles, pad_in_words
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.session.strict_yaml import dump_yaml, load_yaml
 from remaster_ros.types import Controller, PadJoint
 

@@ -10,8 +10,8 @@ from worlds.calibration_scenes import scene
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.errors import InputError
-from remaster_ros.session.reader import write_session
-from remaster_ros.session.together import together
+from remaster_ros.session.records.reader import write_session
+from remaster_ros.session.records.together import together
 from remaster_ros.types import Correction, Session
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.session import robot_description
-from remaster_ros.session.meshes import find_mesh, read_mesh
-from remaster_ros.session.robot_description import read_arm, read_description
-from remaster_ros.session.xacro_expressions import ExpressionError, evaluate, global_names
+from remaster_ros.session.cells import robot_description
+from remaster_ros.session.cells.meshes import find_mesh, read_mesh
+from remaster_ros.session.cells.robot_description import read_arm, read_description
+from remaster_ros.session.cells.xacro_expressions import ExpressionError, evaluate, global_names
 
 NAMESPACE = 'xmlns:xacro="http://www.ros.org/wiki/xacro"'
 # What xacro's own guard lets through: it looks at the names of the outer code alone.

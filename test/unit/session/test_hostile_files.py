@@ -12,10 +12,10 @@ from hostile.files import check_read, read_urdf, spoil_and_read
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.urdf import MOST_LINKS, parse_urdf
 from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.json_records import encoded
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.session.strict_yaml import YamlError, load_yaml
-from remaster_ros.session.workcell import read_cell
 
 CONFIG = Path(__file__).parents[3] / 'config'
 SEED = random.SystemRandom().randrange(10**6)

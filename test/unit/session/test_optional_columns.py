@@ -10,7 +10,7 @@ from worlds.oriented_sessions import make_session
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, matrix_from_quaternion_xyzw, transform
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Correction, Session
 
 

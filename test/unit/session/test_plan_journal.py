@@ -11,9 +11,9 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import REGISTRATION, Tour
 from remaster_ros.planning.tour_planner import registration_tour
-from remaster_ros.session.journal import Journal
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.journal import Journal
+from remaster_ros.session.records.plan_journal import PlanJournal
 
 SETTINGS = {'cell': 'abc', 'seed': 3}
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.priors_file import read_priors
+from remaster_ros.session.records.priors_file import read_priors
 
 GOOD = """
 joint_offsets: {joint_2: {mean_deg: 0.1, std_deg: 0.05}, lift: {mean_mm: 2.0, std_mm: 0.5}}

@@ -10,9 +10,9 @@ from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, Tour
-from remaster_ros.session.journal import Journal
-from remaster_ros.session.plan_journal import PlanJournal, plan_page_path, read_plan
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.journal import Journal
+from remaster_ros.session.records.plan_journal import PlanJournal, plan_page_path, read_plan
 
 CHAIN = read_cell('demo').chain()
 JOINTS = len(CHAIN)

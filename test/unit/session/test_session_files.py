@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.reader import read_session, write_session
+from remaster_ros.session.records.reader import read_session, write_session
 
 DATA = Path(__file__).parents[4] / 'shared' / 'data'
 

@@ -12,8 +12,8 @@ from rigs.command_line import remaster
 from worlds.session_shapes import observations
 
 from remaster_ros.errors import InputError, MovedError
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.records.reader import read_session
+from remaster_ros.session.records.session_writer import SessionWriter
 
 FILES = ('observations.csv', 'journal.jsonl', 'session.yaml', 'robot.urdf')
 

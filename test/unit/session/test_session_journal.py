@@ -10,8 +10,8 @@ from remaster_ros.collection.events import Decided
 from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.recording import BY_HAND
 from remaster_ros.errors import InputError
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_journal import SessionJournal, read_outcomes
+from remaster_ros.session.records.reader import read_session
+from remaster_ros.session.records.session_journal import SessionJournal, read_outcomes
 
 
 def reading(sensor, stamp_s):

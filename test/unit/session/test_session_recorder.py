@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from remaster_ros.collection.events import EventRecord, PoseAnnounced, SolutionFailed
 from remaster_ros.collection.recording import EndedReading, SettledArm
 from remaster_ros.session import session_recorder
-from remaster_ros.session.session_journal import SessionJournal, read_outcomes
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.session_journal import SessionJournal, read_outcomes
 
 CELL, Q = read_cell('demo'), np.zeros((3, 7))
 POSE = PoseAnnounced(

@@ -13,8 +13,8 @@ import pytest
 from worlds.session_shapes import observations
 
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.session.reader import read_session, write_session
-from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.records.reader import read_session, write_session
+from remaster_ros.session.records.session_writer import SessionWriter
 
 
 def test_the_folder_is_readable_after_every_observation(session, tmp_path):
@@ -121,8 +121,8 @@ def test_a_folder_with_files_is_refused(session, tmp_path):
 
 KILLED = """
 import sys
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.session_writer import SessionWriter
+from remaster_ros.session.records.reader import read_session
+from remaster_ros.session.records.session_writer import SessionWriter
 sys.path[:0] = [{tests!r}]
 from worlds.session_shapes import observations
 session = read_session({source!r})

@@ -14,8 +14,8 @@ from remaster_ros.calibration.estimate import Problem, estimate
 from remaster_ros.discovery.to_extension import offsets_of
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix
-from remaster_ros.session.reader import write_session
-from remaster_ros.session.together import disagreements, together
+from remaster_ros.session.records.reader import write_session
+from remaster_ros.session.records.together import disagreements, together
 
 SEED = 5
 

@@ -8,8 +8,8 @@ import yaml
 from worlds.simple_cells import write_cell
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.meshes import mesh_reader, read_mesh
-from remaster_ros.session.workcell import config_path, read_cell
+from remaster_ros.session.cells.meshes import mesh_reader, read_mesh
+from remaster_ros.session.cells.workcell import config_path, read_cell
 
 SIZE = np.array([0.1, 0.2, 0.3])
 ROBOT = {'urdf': 'arm.urdf', 'base_link': 'base_link', 'tip_link': 'tool'}

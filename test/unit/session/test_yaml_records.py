@@ -10,7 +10,7 @@ import pytest
 
 from remaster_ros.bounds import Bounds, Triple
 from remaster_ros.errors import InputError
-from remaster_ros.session.session_yaml import BaseFrame
+from remaster_ros.session.records.session_yaml import BaseFrame
 from remaster_ros.session.yaml_records import read_yaml
 
 

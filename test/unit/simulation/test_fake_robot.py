@@ -7,7 +7,7 @@ from worlds.dynamic_fakes import SteppedWorld
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.session.workcell import config_path
+from remaster_ros.session.cells.workcell import config_path
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.faults import inject
 from remaster_ros.simulation.robot import FakeArm

@@ -9,7 +9,7 @@ from worlds.calibration_scenes import CHAIN, random_poses
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import transform
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import ServoPoint
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide

@@ -7,7 +7,7 @@ import stat
 import pytest
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation import setup
 from remaster_ros.simulation.setup import (
     default_folder,

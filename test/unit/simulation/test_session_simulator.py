@@ -57,7 +57,7 @@ def test_the_same_seed_gives_the_same_session() -> None:
 
 
 def test_it_survives_the_disk(tmp_path: Path) -> None:
-    from remaster_ros.session.reader import read_session, write_session
+    from remaster_ros.session.records.reader import read_session, write_session
 
     session, _ = scene(55, poses=4, validation=2, sensor_count=2)
     write_session(tmp_path / 'session', session)

@@ -17,7 +17,7 @@ import remaster_ros
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, inverse_poses, transform
-from remaster_ros.session.reader import read_session
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.simulated_workcell import simulate_session
 

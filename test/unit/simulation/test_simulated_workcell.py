@@ -8,7 +8,7 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import order_solutions
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation import simulated_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 

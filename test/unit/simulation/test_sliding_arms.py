@@ -13,8 +13,8 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.kinematics.serial_chain import LEVER_M, SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw
-from remaster_ros.session.reader import read_session
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
 from remaster_ros.simulation.simulated_workcell import simulate_session, simulate_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor

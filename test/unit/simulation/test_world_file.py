@@ -7,7 +7,7 @@ import pytest
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply
 from remaster_ros.session import files
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.world import World
 

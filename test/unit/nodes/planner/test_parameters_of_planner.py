@@ -9,7 +9,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.nodes.planner.parameters import Parameters
 from remaster_ros.planning import tour_planner
 from remaster_ros.planning.rival_causes import FoundCause
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
 
 pytestmark = pytest.mark.ros
 

@@ -16,8 +16,8 @@ from remaster_ros.collection.tour_progress import TourProgress
 from remaster_ros.nodes.background import PlanningThread
 from remaster_ros.nodes.planner.plan_preview import PlanPreview
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.session.plan_journal import PlanJournal
-from remaster_ros.session.workcell import read_cell
+from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.plan_journal import PlanJournal
 
 START = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
 COUNTS = {'optimization': 3, 'validation': 2, 'registration': 6}

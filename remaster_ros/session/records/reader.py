@@ -23,8 +23,13 @@ from remaster_ros.session.files import (
     write_atomically,
 )
 from remaster_ros.session.manifest import check_data, read_manifest
-from remaster_ros.session.observations import RowFormat, inverted_readings, optional_of, stacked
-from remaster_ros.session.session_yaml import (
+from remaster_ros.session.records.observations import (
+    RowFormat,
+    inverted_readings,
+    optional_of,
+    stacked,
+)
+from remaster_ros.session.records.session_yaml import (
     SessionHeader,
     parse_header,
     require_known_joints,

@@ -24,14 +24,14 @@ import yaml
 from xacro import substitution_args
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
-from remaster_ros.session.packages import Confinement, find_package
-from remaster_ros.session.xacro_expressions import (
+from remaster_ros.session.cells.packages import Confinement, find_package
+from remaster_ros.session.cells.xacro_expressions import (
     ExpressionError,
     Function,
     evaluate,
     global_names,
 )
+from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
 
 MEMORY = 1024**3
 """Most memory of an expansion, bytes: descriptions of makers take a tenth of it."""

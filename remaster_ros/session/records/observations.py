@@ -23,7 +23,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import LEVER_M, LIMIT_TOLERANCE_RAD, SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
 from remaster_ros.session.files import decode_text, refuse_utf16
-from remaster_ros.session.observation_rules import (
+from remaster_ros.session.records.observation_rules import (
     SPLITS,
     RowKeys,
     SequenceRules,

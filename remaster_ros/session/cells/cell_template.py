@@ -14,8 +14,8 @@ import numpy as np
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import PoseRanges
 from remaster_ros.planning.cell_proposal import HeldJoint, Reach
+from remaster_ros.session.cells.workcell import CellSensor
 from remaster_ros.session.strict_yaml import load_yaml
-from remaster_ros.session.workcell import CellSensor
 
 _PLAIN = re.compile(r'[A-Za-z/.][\w./+-]*')
 

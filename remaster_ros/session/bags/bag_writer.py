@@ -16,8 +16,8 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from remaster_ros.errors import DiskError, InputError
-from remaster_ros.session.bag import LATCHED_TOPICS, BagReader, jazzy_types
-from remaster_ros.session.bag_metadata import (
+from remaster_ros.session.bags.bag import LATCHED_TOPICS, BagReader, jazzy_types
+from remaster_ros.session.bags.bag_metadata import (
     METADATA_FILE,
     FileMetadata,
     TopicMetadata,

@@ -18,7 +18,7 @@ from remaster_ros.calibration.estimate import Estimate, estimate
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.calibration.one_arm import OffsetDifferences, offset_differences
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
-from remaster_ros.session.observations import stacked
+from remaster_ros.session.records.observations import stacked
 from remaster_ros.types import Measurements, Session
 
 

@@ -19,10 +19,16 @@ from remaster_ros.collection.pairing import PairedReading
 from remaster_ros.collection.recording import BY_HAND
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.journal import Record, read_journal
-from remaster_ros.session.reader import HEADER, JOURNAL, OBSERVATIONS_LIMIT, ROWS, read_header
-from remaster_ros.session.session_writer import SessionWriter
-from remaster_ros.session.session_yaml import ExitStatus
+from remaster_ros.session.records.journal import Record, read_journal
+from remaster_ros.session.records.reader import (
+    HEADER,
+    JOURNAL,
+    OBSERVATIONS_LIMIT,
+    ROWS,
+    read_header,
+)
+from remaster_ros.session.records.session_writer import SessionWriter
+from remaster_ros.session.records.session_yaml import ExitStatus
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.types import Correction, FloatArray, Observation, Session, Split
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from remaster_ros.session.cells.workcell import Workcell, config_path
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.strict_yaml import dump_yaml, load_yaml
-from remaster_ros.session.workcell import Workcell, config_path
 from remaster_ros.session.yaml_records import YAML_LIMIT
 
 # Those of the live page, as RViz writes them: red; green; blue.

@@ -33,8 +33,8 @@ from remaster_ros.planning.candidates import (
 )
 from remaster_ros.planning.expected_sensors import POSE_SIGMA_M, SIGMA_M, ExpectedSensor
 from remaster_ros.planning.pose_settings import PoseSettings
+from remaster_ros.session.cells.meshes import mesh_reader
 from remaster_ros.session.files import URDF_LIMIT, decode_text, read_limited
-from remaster_ros.session.meshes import mesh_reader
 from remaster_ros.session.yaml_records import YAML_LIMIT, read_yaml, with_line
 from remaster_ros.types import FARTHEST_M, FloatArray, SensorKind
 
@@ -453,7 +453,7 @@ def config_path(name: str) -> Path:
 
     Raises InputError if the package was installed without it.
     """
-    folder = Path(__file__).resolve().parents[2] / 'config'
+    folder = Path(__file__).resolve().parents[3] / 'config'
     if (folder / 'cells').is_dir():
         return folder / name
     spec = importlib.util.find_spec('remaster_ros.config')

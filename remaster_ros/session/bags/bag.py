@@ -19,10 +19,10 @@ from mcap.records import Channel, Message, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from remaster_ros.errors import InputError
-from remaster_ros.session.bag_metadata import FileMetadata, all_of
+from remaster_ros.session.bags.bag_metadata import FileMetadata, all_of
+from remaster_ros.session.bags.mcap_records import CutOffError, frames, unchunked, without_zeros
 from remaster_ros.session.files import reason
 from remaster_ros.session.manifest import check_file, read_manifest
-from remaster_ros.session.mcap_records import CutOffError, frames, unchunked, without_zeros
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

@@ -25,9 +25,9 @@ from remaster_ros.planning.candidates import Plan
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, PoseVisit, Tour
 from remaster_ros.session.files import make_folder
-from remaster_ros.session.journal import Journal, Record, read_journal
-from remaster_ros.session.reader import PLAN
-from remaster_ros.session.session_journal import read_outcomes
+from remaster_ros.session.records.journal import Journal, Record, read_journal
+from remaster_ros.session.records.reader import PLAN
+from remaster_ros.session.records.session_journal import read_outcomes
 from remaster_ros.session.yaml_records import from_plain, to_plain
 
 Configuration = tuple[str, int, int]

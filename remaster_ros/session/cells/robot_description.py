@@ -37,7 +37,7 @@ _COLOURS = re.compile(r'\x1b\[[0-9;]*m')
 # Not -m: that would put the working folder, which may be the description's, before the modules.
 _SERVE = (
     'import json, sys; request = json.load(sys.stdin); sys.path[:] = request["modules"]; '
-    'from remaster_ros.session.xacro_expansion import serve; serve(request)'
+    'from remaster_ros.session.cells.xacro_expansion import serve; serve(request)'
 )
 
 log = logging.getLogger('remaster_ros')

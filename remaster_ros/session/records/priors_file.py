@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.bounds import Bounds, Triple
 from remaster_ros.errors import InputError
 from remaster_ros.session.files import read_limited
-from remaster_ros.session.session_yaml import PRIORS_HELP, BaseFrame
+from remaster_ros.session.records.session_yaml import PRIORS_HELP, BaseFrame
 from remaster_ros.session.yaml_records import YAML_LIMIT, read_yaml
 from remaster_ros.types import (
     Priors,

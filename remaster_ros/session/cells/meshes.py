@@ -18,8 +18,8 @@ from urllib.parse import unquote
 import numpy as np
 
 from remaster_ros.errors import InputError
+from remaster_ros.session.cells.packages import Confinement, find_package, package_of, sourced
 from remaster_ros.session.files import read_limited, refuse_utf16
-from remaster_ros.session.packages import Confinement, find_package, package_of, sourced
 from remaster_ros.types import FloatArray, IntArray
 
 MESH_LIMIT = 64 * 1024**2

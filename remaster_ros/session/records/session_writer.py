@@ -27,11 +27,11 @@ from remaster_ros.session.files import (
     write_atomically,
     writing,
 )
-from remaster_ros.session.journal import Journal, Record
 from remaster_ros.session.manifest import check_file, read_manifest, remove_manifest, write_sums
-from remaster_ros.session.observation_rules import RowKeys, SequenceRules
-from remaster_ros.session.observations import RowFormat
-from remaster_ros.session.reader import (
+from remaster_ros.session.records.journal import Journal, Record
+from remaster_ros.session.records.observation_rules import RowKeys, SequenceRules
+from remaster_ros.session.records.observations import RowFormat
+from remaster_ros.session.records.reader import (
     HEADER,
     JOURNAL,
     OBSERVATIONS_LIMIT,
@@ -41,8 +41,8 @@ from remaster_ros.session.reader import (
     read_chain,
     read_header,
 )
-from remaster_ros.session.session_guard import SessionGuard, rename_changed
-from remaster_ros.session.session_yaml import (
+from remaster_ros.session.records.session_guard import SessionGuard, rename_changed
+from remaster_ros.session.records.session_yaml import (
     ExitStatus,
     parse_header,
     with_correction,

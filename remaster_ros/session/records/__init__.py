@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Records of a session folder: session.yaml, observations.csv, and the journals before them."""
