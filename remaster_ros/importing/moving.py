@@ -127,6 +127,7 @@ class _Frames:
     stamps: FloatArray  # s, rising, (f,)
     positions: FloatArray  # m, NaN of a marker that was not seen, (f, m, 3)
     markers: IntArray  # Indices of the m markers
+    scatter_s: float = 0.0  # Of the stamps that constant ones took the place of, s
 
     @classmethod
     def of(cls, streams: Sequence[MarkerStream], markers: Sequence[str]) -> _Frames:
@@ -142,7 +143,8 @@ class _Frames:
     def at_constant_rate(self) -> _Frames | None:
         """Frames with stamps at a constant rate; None if they do not come at one.
 
-        They do if 99 % of the stamps are within half a period of it and no two are in one period.
+        They do if 99 % of the stamps are within half a period of it, each in a period of its own;
+        the others, of a moment at which a host was held up, are left out.
         """
         stamps = self.stamps
         gaps = np.diff(stamps)
@@ -164,10 +166,15 @@ class _Frames:
         whole = np.round((stamps - stamps[0]) / period)
         line = np.polynomial.Polynomial.fit(whole, stamps, 1)
         steady = line(whole)
-        within = np.abs(stamps - steady) < 0.5 * period
-        if np.mean(within) < AT_A_RATE or np.any(np.diff(whole) < 1.0):
+        off = np.abs(stamps - steady)
+        # Of several in a period the nearest.
+        order = np.lexsort((off, whole))
+        nearest = order[np.diff(whole[order], prepend=-1.0) > 0.0]
+        kept = np.sort(nearest[off[nearest] < 0.5 * period])
+        if len(kept) < AT_A_RATE * len(stamps):
             return None
-        return replace(self, stamps=steady)
+        scatter_s = float(np.std(stamps[kept] - steady[kept]))
+        return _Frames(steady[kept], self.positions[kept], self.markers, scatter_s)
 
 
 def _less_mean(values: FloatArray, run: IntArray) -> FloatArray:
@@ -560,11 +567,13 @@ def _restamped(name: str, frames: _Frames, steady: _Frames) -> str:
     """Sentence on stamps that were replaced; '' if they were not."""
     if steady is frames:
         return ''
-    scatter_ms = 1e3 * float(np.std(frames.stamps - steady.stamps))
     rate_hz = 1.0 / float(np.median(np.diff(steady.stamps)))
+    left_out = len(frames.stamps) - len(steady.stamps)
+    without = f'; {counted(left_out, "frame")} far from it left out' if left_out else ''
     return (
-        f'the stamps of {name} scatter by {scatter_ms:.2f} ms about a constant rate of '
-        f'{rate_hz:.2f} Hz, with which the robot fits better: they are replaced by it'
+        f'the stamps of {name} scatter by {1e3 * steady.scatter_s:.2f} ms about a constant rate '
+        f'of {rate_hz:.2f} Hz, with which the robot fits better: they are replaced by it'
+        f'{without}'
     )
 
 

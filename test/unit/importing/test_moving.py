@@ -149,6 +149,14 @@ def test_frames_of_no_constant_rate_keep_their_stamps():
     assert frames(np.cumsum(rng.exponential(1.0 / 120.0, 1000))) is None
     assert frames(np.cumsum(rng.choice([0.008, 0.013], 1000))) is None
     assert frames(np.array([1.0])) is None
+    # A host that was held up for a moment: its frames come together, and are left out.
+    late = regular.copy()
+    late[200:206] = late[205] + 1e-5 * np.arange(6)
+    steady = frames(late)
+    assert len(regular) - 6 <= len(steady.stamps) < len(regular)
+    at = np.searchsorted(regular, steady.stamps - 2e-3)
+    np.testing.assert_allclose(steady.stamps, regular[at], atol=2e-4)
+    assert np.all(np.diff(steady.stamps) > 5e-3)
 
 
 def test_the_bend_of_a_path_moves_no_row():
@@ -182,9 +190,6 @@ def test_fit_has_the_dynamics_and_the_paper_sampler_refuses(session):
     result = fit_session(session, rng=np.random.default_rng(0))
     assert {'clock_bar', 'lag_2', 'windup_3', 'inertia_2', 'tool_mode_x'} <= {*result.theta_names}
     assert result.accuracy['optimization']['relative']['before'] is None
-    rows = dict(motion_rows(fit_content(result)))
-    assert rows['stamps of bar'].endswith(('late', 'early'))
-    assert [what for what in rows if what.startswith('joint_')] == list(CHAIN.joint_names)
     with pytest.raises(InputError, match='no dynamics'):
         fit_session(session, rng=np.random.default_rng(0), sampler='paper')
 
@@ -308,6 +313,10 @@ def test_standstills_prove_a_fit_of_motion_or_doubt_it(stopped):
     assert result.motion_proof.poses == len(np.unique(still.measurements.pose))
     assert not result.motion_proof.disagree
     assert result.motion_proof.words in verdict(result).points
+    rows = dict(motion_rows(fit_content(result)))
+    assert rows['stamps of bar'].endswith(('late', 'early'))
+    assert [what for what in rows if what.startswith('joint_')] == list(CHAIN.joint_names)
+    assert f'{result.motion_proof.standstill_mm:.3f} mm' in [*rows.values()][-1]
     # A joint that stands half a tenth of a degree elsewhere than it did in motion.
     other = replace(still, measurements=replace(still.measurements, q=still.measurements.q + 1e-3))
     doubted = fit_session(
