@@ -149,6 +149,7 @@ def moved(found):
     return replace(found.rows, seconds=0.05 + 0.1 * np.arange(len(found.rows.seconds)))
 
 
+@pytest.mark.qualify
 def test_information_a_second_beats_random_curves_and_straight_lines():
     by_curves, by_lines = [], []
     for seed in range(5):
