@@ -330,6 +330,8 @@ def run(args: argparse.Namespace) -> int:
             f'{args.files[-1]}: --moving takes one bag, with joint states and frames as recorded'
             + (f'; that of this session is {own}' if is_bag(own) else '')
         )
+    if args.proof is not None and not args.moving:
+        raise InputError('--proof is for a bag of a moving arm: give it with --moving')
     if len(args.files) == 1 and (args.files[0] / HEADER).exists():
         return _mend(args)
     if args.urdf is None and args.cell is None:

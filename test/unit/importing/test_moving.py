@@ -383,6 +383,9 @@ def test_what_cannot_be_measured_in_motion_is_refused(recording, tmp_path, capsy
     command = ['import', '--moving', str(tmp_path / 'table.csv'), '--cell', 'demo']
     assert main([*command, '--out', str(tmp_path / 's')]) == 2
     assert '--moving takes one bag' in capsys.readouterr().err
+    command = ['import', str(tmp_path / 'table.csv'), '--cell', 'demo', '--proof', str(tmp_path)]
+    assert main([*command, '--out', str(tmp_path / 's')]) == 2
+    assert '--proof is for a bag of a moving arm' in capsys.readouterr().err
     # A session is no bag: it is not written again as it is.
     session = tmp_path / 'session'
     (session / 'bag').mkdir(parents=True)
