@@ -100,6 +100,9 @@ class PosePlanner(RemasterNode):
         self._preview = PlanPreview(
             self.cell, self._tours, self.journal, self.progress, folder, Background(self)
         )
+        if self.p.moving_s and self.progress.phase == REGISTRATION:
+            # While nothing is collected yet, and while the sensors are registered.
+            Background(self).submit(self._tours.prepare, lambda result: None)
         self._inspections = Inspections(self, folder, self.p, self.cell, self._tours)
         self._living: LivingRun | None = None
         self._tried_wall = 0.0

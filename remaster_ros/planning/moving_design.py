@@ -189,6 +189,29 @@ def check_sensors(scene: PlanningScene, sensors: Sequence[ExpectedSensor]) -> No
             )
 
 
+def sights_of(scene: PlanningScene, sensors: Sequence[ExpectedSensor]) -> list[LineOfSight]:
+    """Lines of sight to every marker, not only to the one that a sensor follows."""
+    angles = {sight.sensor: sight.max_angle_rad for sight in scene.sights}
+    return [
+        LineOfSight(sensor.name, sensor.position_R, place, angles[sensor.name], marker)
+        for sensor in sensors
+        for marker, place in sensor.markers.items()
+    ]
+
+
+def stays_in_sight(
+    design: MovingDesign,
+    scene: PlanningScene,
+    settings: DesignSettings,
+    sensors_R: Mapping[str, FloatArray],
+) -> bool:
+    """Whether sensors at these positions in R, m, (3,), see every marker all along the curves."""
+    sights = sights_of(scene, settings.with_sensors_at(sensors_R).sensors)
+    ends = np.array([pose.solutions[0] for pose in (design.begin, *design.ends, *design.proof)])
+    places = [ends, *map(_fine, design.curves)]
+    return bool(np.all(in_sight(scene, sights, np.concatenate(places))))
+
+
 class _Search:
     """Curves under way."""
 
@@ -211,13 +234,7 @@ class _Search:
         self._extra = self._model.travel(
             np.zeros(len(self._chain)), SAGITTA_RAD * np.ones(len(self._chain))
         )
-        angles = {sight.sensor: sight.max_angle_rad for sight in scene.sights}
-        # Every marker, not only the one that a sensor follows.
-        self._sights = [
-            LineOfSight(sensor.name, sensor.position_R, place, angles[sensor.name], marker)
-            for sensor in sensors
-            for marker, place in sensor.markers.items()
-        ]
+        self._sights = sights_of(scene, sensors)
         self._pool = self._drawn(sensors, before)
         middle = self._chain.positions(self._pool, np.zeros(3)).mean(axis=0)
         self._information = MovingInformation(self._chain, sensors, marker_std_m, middle, OWN_M)

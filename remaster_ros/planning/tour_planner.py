@@ -5,18 +5,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 
-from remaster_ros.errors import InputError, InsufficientDataError
+from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.planning.candidates import Plan, PlannedPose, PlanningScene, order_solutions
-from remaster_ros.planning.moving_design import MOVING_S, MovingDesign, design_moving
+from remaster_ros.planning.moving_design import (
+    MOVING_S,
+    MovingDesign,
+    design_moving,
+    stays_in_sight,
+)
 from remaster_ros.planning.planned_design import (
     POOL_CANDIDATES,
     DesignResult,
@@ -47,6 +53,9 @@ REGISTRATION_CANDIDATES = 12
 """Default number of candidate poses for the three-point registration."""
 MORE_CANDIDATES = 10 * REGISTRATION_CANDIDATES
 """Additional candidates if fewer than three of these are usable."""
+ROOM_RAD = np.deg2rad(6.0)
+"""Curves that are prepared for rough positions keep so much of the angle at which a marker is
+visible: a sensor may be 0.15 m from there at 1.5 m."""
 MOST_TRIES = 5
 """Most repetitions of a choice if a pose has no free path to it."""
 VERIFIED_POSES = 10
@@ -151,6 +160,8 @@ class TourPlanner:
         self.separating_design: SeparatingDesign | None = None
         self.moving_s = moving_s
         self.moving_design: MovingDesign | None = None
+        # Curves for sensors at their rough positions.
+        self._prepared: MovingDesign | None = None
 
     @property
     def rough_places(self) -> dict[str, FloatArray]:
@@ -228,11 +239,13 @@ class TourPlanner:
         ``T_R_N``: registrations, (4, 4) each. Sets `moving_design`. Raises as `design_moving`.
         """
         sensors_R = {name: T[:3, 3] for name, T in T_R_N.items()}
-        rng = np.random.default_rng([self._seed, *b'moving'])
-        seconds = self.moving_s or MOVING_S
-        design = design_moving(
-            self.scene, self.travel, self.design, sensors_R, rng, seconds, self._likely_end()
-        )
+        design = self._prepared
+        if (
+            design is None
+            or sensors_R.keys() != self.scene.rough_R.keys()
+            or not stays_in_sight(design, self.scene, self.design, sensors_R)
+        ):
+            design = self._curves(sensors_R)
         self.moving_design = design
         held_out = Plan((*design.ends, *design.proof))
         return Tour(
@@ -242,6 +255,41 @@ class TourPlanner:
             one_solution=True,
             model=self.model,
             order=[(FITTED, 0, 0), *((HELD_OUT, i, 0) for i in range(len(held_out.poses)))],
+        )
+
+    def prepare(self) -> None:
+        """Choose the curves of `moving` for sensors at their rough positions, ahead of it.
+
+        That takes half a minute. They are taken where registered sensors see them as well; where
+        none are found, `moving` says why. Nothing for stop and go.
+        """
+        if not self.moving_s:
+            return
+        sights = [
+            replace(sight, max_angle_rad=sight.max_angle_rad - ROOM_RAD)
+            for sight in self.scene.sights
+        ]
+        with suppress(RemasterError):
+            scene = replace(self.scene, sights=sights)
+            self._prepared = self._prepared or self._curves(self.scene.rough_R, scene)
+
+    def _curves(
+        self, sensors_R: Mapping[str, FloatArray], scene: PlanningScene | None = None
+    ) -> MovingDesign:
+        """Return curves for sensors at these positions in R, m, (3,); as `design_moving`.
+
+        ``scene``: None for that of this planner.
+        """
+        rng = np.random.default_rng([self._seed, *b'moving'])
+        seconds = self.moving_s or MOVING_S
+        return design_moving(
+            scene or self.scene,
+            self.travel,
+            self.design,
+            sensors_R,
+            rng,
+            seconds,
+            self._likely_end(),
         )
 
     def _likely_end(self) -> FloatArray:

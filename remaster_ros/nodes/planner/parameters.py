@@ -13,6 +13,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.limits import SLOWEST_M_S
 from remaster_ros.nodes.parameters import parameter
 from remaster_ros.nodes.planner.inspections import InspectionParameters
+from remaster_ros.nodes.planner.prepared_tours import PreparedTours
 from remaster_ros.planning.moving_design import (
     LONGEST_MOVING_S,
     SHORTEST_MOVING_S,
@@ -126,7 +127,7 @@ class Parameters(InspectionParameters):
         if self.moving_s:
             # At the start, and not when the arm has been moved to register the sensors.
             check_sensors(scene, design.sensors)
-        return TourPlanner(
+        return PreparedTours(
             scene,
             counts,
             self.seed,

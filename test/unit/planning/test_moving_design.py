@@ -221,6 +221,27 @@ def test_a_session_goes_curve_by_curve_and_ends_with_its_proof(monkeypatch):
     assert fingerprint(plan.tour) != name
 
 
+def test_curves_are_prepared_for_sensors_about_where_they_are(monkeypatch):
+    """Before the registration; anew where a registered sensor does not see them."""
+    monkeypatch.setattr(moving_design, 'EXCHANGES', 15)
+    planner = planner_of()
+    planner.prepare()
+    near = {name: T.copy() for name, T in planner.rough_places.items()}
+    near['mocap'][:3, 3] += (-0.05, 0.06, 0.09)
+    tour = planner.moving(near)
+    prepared = planner.moving_design
+    planner.moving(planner.rough_places)
+    assert planner.moving_design is prepared
+    aside = {name: T.copy() for name, T in planner.rough_places.items()}
+    aside['mocap'][:3, 3] += (-0.5, 1.5, 0.0)
+    planner.moving(aside)
+    assert planner.moving_design is not prepared
+    # Another planner prepares the same.
+    other = planner_of()
+    other.prepare()
+    assert fingerprint(other.moving(planner.rough_places)) == fingerprint(tour)
+
+
 def test_stop_and_go_has_no_curves():
     planner = planner_of(seconds=0.0)
     tour = planner.collection(planner.rough_places)
