@@ -230,16 +230,20 @@ class Demo:
 
     def _remaster(self, *arguments: str) -> None:
         """Run a command of `remaster`, and print what it says; raise DeviceError if it fails."""
+        done = self._run(*arguments)
+        self.console.print(done.stdout.strip(), soft_wrap=True, markup=False, highlight=False)
+        if done.returncode:
+            raise DeviceError(f'remaster {arguments[0]}: {done.stderr.strip()}')
+
+    def _run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Print a command of `remaster`, and run it in a process of its own."""
         self.console.print(f'remaster {" ".join(arguments)}', soft_wrap=True)
-        done = subprocess.run(
+        return subprocess.run(
             [sys.executable, '-m', 'remaster_ros.cli.main', *arguments],
             capture_output=True,
             text=True,
             check=False,
         )
-        self.console.print(done.stdout.strip(), soft_wrap=True, markup=False, highlight=False)
-        if done.returncode:
-            raise DeviceError(f'remaster {arguments[0]}: {done.stderr.strip()}')
 
     def _apply(self) -> Path:
         """Collect again with the bridge's correction; return the file of the correction.
@@ -266,14 +270,7 @@ class Demo:
 
     def _print_applied(self, file: Path) -> None:
         """Print the verdict of `remaster verify` on the corrected poses, and the true errors."""
-        command = ['verify', str(self.corrected), '--compensation', str(file)]
-        self.console.print(f'remaster {" ".join(command)}', soft_wrap=True)
-        done = subprocess.run(
-            [sys.executable, '-m', 'remaster_ros.cli.main', *command],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        done = self._run('verify', str(self.corrected), '--compensation', str(file))
         self.console.print((done.stdout or done.stderr).strip())
         before, after = true_errors(
             read_session(self.corrected), read_compensation(file).compensator, self.world.truth

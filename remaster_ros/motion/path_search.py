@@ -10,12 +10,9 @@ from remaster_ros.kinematics.free_paths import free_path, way_out
 from remaster_ros.motion.actions import CheckPath, PathAnswer
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.motion.path_check import FreePath, PointSpeeds
-from remaster_ros.motion.spline import SAGITTA_RAD, Spline
+from remaster_ros.motion.spline import BEGINS_RAD, SAGITTA_RAD, Spline
 
 SEED = 20
-BEGINS_RAD = 0.02
-"""An arm stands where a curve begins if no joint is further off, rad: ten times what counts as
-arrived by default. The curve that is checked begins where it stands."""
 
 
 class PathSearch:
@@ -71,16 +68,10 @@ class PathSearch:
         through = np.vstack([request.start, points[1:], request.target])
         spline = Spline.through(through, np.append(shares, 1.0))
         samples = spline.samples[1]
-        if self._model.path_trouble(samples, self.beside_m):
+        if self._model.path_trouble(samples, beside_chords_m(self._model)):
             return None
         fastest = self._speeds.fastest(samples, spline.at(spline.samples[0], 1))
         return FreePath(samples, (float(np.max(fastest)),), curve=spline)
-
-    @property
-    def beside_m(self) -> float:
-        """How far a body may be beside its place on the chords of a curve's samples, m."""
-        chain = self._model.chain
-        return self._model.travel(np.zeros(len(chain)), SAGITTA_RAD * chain.per_radian)
 
     def _path(self, points: np.ndarray, *, is_way_out: bool = False) -> FreePath:
         """Return points (n, k) as a path, with the peak speeds of its lines.
@@ -88,3 +79,9 @@ class PathSearch:
         ``is_way_out``: whether it leads out of a contact, and is gone slowly.
         """
         return FreePath(points, self._speeds.peaks_m(points), is_way_out)
+
+
+def beside_chords_m(model: CollisionModel) -> float:
+    """Return how far a body may be beside its place on the chords of a curve's samples, m."""
+    joints = len(model.chain)
+    return model.travel(np.zeros(joints), np.full(joints, SAGITTA_RAD))

@@ -17,10 +17,15 @@ from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.types import FloatArray
 
 STRAIGHT_SHARE = 0.6
-"""Share of the first and of the last interval between two configurations that is straight."""
+"""Share of the first and of the last interval between two configurations that is straight: of an
+interval of 1.5 s the 0.9 s that a beginning takes (`trajectory.LEAD_S`), 0.6 s to bend."""
+BEGINS_RAD = 0.02
+"""An arm stands where a curve begins if no joint is further off, rad: ten times what counts as
+arrived by default. The curve that is checked and gone begins where it stands."""
 SAGITTA_RAD = 2e-4
-"""The samples of a spline are so near that no chord between two is further from it, rad: at the
-end of an arm of a metre 0.2 mm, which the path check adds to the clearance."""
+"""The samples of a spline are so near that no chord between two is further from it, rad, or m of a
+joint that slides: at the end of an arm of a metre 0.2 mm, which path checks add to the clearance
+(`path_search.beside_chords_m`)."""
 MOST_POINTS = 100
 """A curve through more places is refused: with one a second that is a minute and a half."""
 MOST_SAMPLES = 4_000
@@ -111,10 +116,7 @@ class Spline:
 
     @cached_property
     def _counts(self) -> FloatArray:
-        """Number of chords of each piece, (m,), by `SAGITTA_RAD`.
-
-        Of a joint that slides, which has no unit here, that is 0.2 mm of its way.
-        """
+        """Number of chords of each piece, (m,), by `SAGITTA_RAD`."""
         _, _, c, d = self.coefficients
         h = np.diff(self.knots)
         # A cubic bends most at one of its ends.

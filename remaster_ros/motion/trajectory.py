@@ -187,16 +187,8 @@ class Curve(RampedPath):
         from there. The straight piece at the beginning is begun and stopped as a line is, and
         takes at least `LEAD_S`; that at the end holds the ramp. ``peak_m``: as of `Line.within`.
         """
-        shares, _ = spline.samples
-        first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
-        speed = np.max(first / limits.velocity)
-        # r² |q''| + r |q'| / RAMP_S = a, solved for the rate r in a form that needs no q''.
-        a, b = HEADROOM * limits.acceleration, first / RAMP_S
-        rates = 2.0 * a / (b + np.sqrt(b**2 + 4.0 * second * a) + 1e-300)
-        lead = np.max(first[0] / (STOPPABLE * limits.acceleration * RAMP_S))
         rate = min(
-            float(HEADROOM / max(speed, lead, 1e-12)),
-            float(np.min(rates)),
+            float(np.min(allowed_rates(limits, spline))),
             spline.straight_until / LEAD_S,
             (1.0 - spline.straight_from) / RAMP_S,
         )
@@ -263,6 +255,23 @@ class Curve(RampedPath):
         low, high = (self.share(time_s)[0] for time_s in window_s)
         share = float(self.spline.nearest(q[None], units, low, high)[0])
         return share, units.largest(q - self.place(share))
+
+
+def allowed_rates(limits: MotionLimits, spline: Spline) -> FloatArray:
+    """Return the largest rate of the share at each sample of a spline, 1/s, (p,).
+
+    By the speeds and accelerations, the latter also of a stop in `RAMP_S` from there; on the
+    straight beginning by those of a line. Less `HEADROOM`; the speeds of points are not looked at.
+    """
+    shares, _ = spline.samples
+    first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
+    # r² |q''| + r |q'| / RAMP_S = a, solved for the rate r in a form that needs no q''.
+    a, b = HEADROOM * limits.acceleration, first / RAMP_S
+    rates = 2.0 * a / (b + np.sqrt(b**2 + 4.0 * second * a) + 1e-300)
+    speed = np.max(first / limits.velocity, axis=1)
+    lead = np.max(first / (STOPPABLE * limits.acceleration * RAMP_S), axis=1)
+    slowest = np.where(shares <= spline.straight_until, np.maximum(speed, lead), speed)
+    return np.minimum(np.min(rates, axis=1), HEADROOM / np.maximum(slowest, 1e-12))
 
 
 def _ramp(time_s: float) -> tuple[float, float]:

@@ -105,13 +105,13 @@ def waypoints_message(
     """
     message = JointTrajectory(joint_names=list(joint_names))
     message.header = header
-    for i, path in enumerate(stop.paths):
-        shares = stop.shares[i] if i < len(stop.shares) else ()
-        marks = 1 + np.round(np.multiply(shares, SHARES)).astype(int) if len(shares) else ()
-        times = [Duration(sec=i + 1, nanosec=int(mark)) for mark in marks]
+    for i, (path, shares) in enumerate(zip(stop.paths, stop.shares, strict=True)):
+        marks = 1 + np.round(shares * SHARES).astype(int) if len(shares) else [0] * len(path)
         message.points += [
-            JointTrajectoryPoint(positions=q.tolist(), time_from_start=time)
-            for q, time in zip(path, times or [duration_of(i + 1.0)] * len(path), strict=True)
+            JointTrajectoryPoint(
+                positions=q.tolist(), time_from_start=Duration(sec=i + 1, nanosec=int(mark))
+            )
+            for q, mark in zip(path, marks, strict=True)
         ]
     return message
 

@@ -290,12 +290,12 @@ def _reasons(
     """
     # More clearance than the bridge requires: an arm slightly off its path may still move.
     collisions = arm.reasons(q, RESERVE_M)
-    bad = [collisions != '', *(_is_hidden(arm, q, sight) for sight in lines_of_sight)]
+    bad = [collisions != '', *(is_hidden(arm, q, sight) for sight in lines_of_sight)]
     names = [NO_LINE_OF_SIGHT + sight.sensor for sight in lines_of_sight]
     return np.select(bad, [collisions, *names], default='')
 
 
-def _is_hidden(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
+def is_hidden(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
     """Whether the marker faces away from the sensor or the arm hides it, (m,).
 
     It faces away beyond `max_angle_rad`. ``q``: rad or m, (m, k).

@@ -13,7 +13,7 @@ import numpy as np
 from remaster_ros.errors import InsufficientDataError, RemasterError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.motion.trajectory import Trajectory
-from remaster_ros.planning.candidates import CurvedWay, PlannedPose
+from remaster_ros.planning.candidates import PlannedPose
 from remaster_ros.planning.moving_design import MovingDesign
 from remaster_ros.planning.planned_design import NO_FREE_PATH, DesignResult
 from remaster_ros.planning.separating_design import SeparatingDesign
@@ -26,10 +26,6 @@ REGISTERING = 3
 """Poses that register the sensors; further ones are visited only if a sensor misses one."""
 FEW_MISSED, MOST_MISSED = 4, 12
 """Poses without a path after which a count ends, since each takes seconds of search."""
-
-
-BEGINS_RAD = 0.02
-"""An arm stands where a curve begins if no joint is further off, rad, as for the bridge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,10 +145,10 @@ def look_ahead(
     for tour in tours:
         remaining = tour.fork()
         if visit is not None:
-            steps.go(remaining.reroute(visit, steps.here), _way(tour, visit))
+            steps.go(remaining.reroute(visit, steps.here))
             visit = None
         while (following := remaining.next(steps.here)) is not None:
-            steps.go(following, _way(tour, following))
+            steps.go(following)
     if not steps.visits:
         standing = planner.model.trouble(start) or 'no free way leads from there'
         raise InsufficientDataError(
@@ -204,21 +200,6 @@ def look_ahead(
     )
 
 
-def _way(tour: Tour, visit: PoseVisit) -> CurvedWay | None:
-    """Return the curve by which the arm comes to a visit; None if any free path will do."""
-    return tour.plans[visit.split].poses[visit.index].way
-
-
-def _begins(way: CurvedWay | None, q: FloatArray, travel: TravelTime) -> bool:
-    """Whether there is a curve, and it begins at a configuration, (k,)."""
-    return way is not None and travel.limits.units.largest(way.points[0] - q) <= BEGINS_RAD
-
-
-def _through(way: CurvedWay, here: FloatArray, end: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the points of a curve, (n, k), from where the arm stands, and their shares, (n,)."""
-    return np.vstack((here, way.points[1:], end)), np.append(way.shares, 1.0)
-
-
 def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float:
     """Return the approximate robot time of a whole session, s, without a search for paths.
 
@@ -235,10 +216,10 @@ def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float
     for each in tours:
         straight = each.restarted_straight()
         while (visit := straight.next(position)) is not None:
-            way = _way(each, visit)
-            for q in visit.solutions:
-                if way is not None and _begins(way, position, planner.travel):
-                    total += planner.travel.curve(*_through(way, position, q))[0].duration_s
+            for q, through, shares in zip(visit.solutions, visit.paths, visit.shares, strict=True):
+                if len(shares):
+                    points = np.vstack((position, through[1:], q))
+                    total += planner.travel.curve(points, shares)[0].duration_s
                 else:
                     total += float(planner.travel.straight(position, q[None])[0])
                 total += planner.travel.measuring_s
@@ -321,19 +302,19 @@ class _Steps:
         self.visits: list[PlannedVisit] = []
         self.unreached: list[tuple[str, int, int]] = []
 
-    def go(self, visit: PoseVisit, way: CurvedWay | None = None) -> None:
+    def go(self, visit: PoseVisit) -> None:
         """Add the motions to all solutions of a visit, from `here`, which becomes the last one.
 
-        Solutions without a path are added to `unreached`. ``way``: the curve to the visit, if it
-        has one and the arm stands where that begins.
+        Solutions without a path are added to `unreached`.
         """
         self.unreached += [(visit.split, visit.index, number) for number in visit.unreached]
-        for q, waypoints in zip(visit.solutions, visit.paths, strict=True):
-            if way is not None and _begins(way, self.here, self._travel):
-                curve, speed = self._travel.curve(*_through(way, self.here, q))
+        for q, through, shares in zip(visit.solutions, visit.paths, visit.shares, strict=True):
+            if len(shares):
+                points = np.vstack((self.here, through[1:], q))
+                curve, speed = self._travel.curve(points, shares)
                 trajectory = Trajectory((curve,))
             else:
-                trajectory, speed = self._travel.trajectory(np.vstack((self.here, waypoints, q)))
+                trajectory, speed = self._travel.trajectory(np.vstack((self.here, through, q)))
             self.visits.append(PlannedVisit(visit.split, visit.index, trajectory, speed))
             self.here = q
         self._progress(len(self.visits))

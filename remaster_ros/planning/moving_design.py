@@ -20,13 +20,15 @@ from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
 from remaster_ros.kinematics.free_paths import is_straight_free
 from remaster_ros.linear_algebra import one_thread
-from remaster_ros.motion.spline import SAGITTA_RAD, STRAIGHT_SHARE
-from remaster_ros.motion.trajectory import HEADROOM, LEAD_S, RAMP_S, Curve
+from remaster_ros.motion.path_search import beside_chords_m
+from remaster_ros.motion.spline import STRAIGHT_SHARE
+from remaster_ros.motion.trajectory import HEADROOM, LEAD_S, RAMP_S, Curve, allowed_rates
 from remaster_ros.planning.candidates import (
     CurvedWay,
     LineOfSight,
     PlannedPose,
     PlanningScene,
+    is_hidden,
 )
 from remaster_ros.planning.expected_sensors import ExpectedSensor
 from remaster_ros.planning.moving_information import (
@@ -231,9 +233,7 @@ class _Search:
         self._limits = travel.limits
         self._curves = max(2, round(moving_s / CURVE_S))
         self._margin = scene.limit_margin_rad * self._chain.per_radian
-        self._extra = self._model.travel(
-            np.zeros(len(self._chain)), SAGITTA_RAD * np.ones(len(self._chain))
-        )
+        self._extra = beside_chords_m(self._model)
         self._sights = sights_of(scene, sensors)
         self._pool = self._drawn(sensors, before)
         middle = self._chain.positions(self._pool, np.zeros(3)).mean(axis=0)
@@ -482,15 +482,9 @@ def _with(points: FloatArray, at: int, new: FloatArray) -> FloatArray:
 
 def in_sight(scene: PlanningScene, sights: Sequence[LineOfSight], q: FloatArray) -> BoolArray:
     """Whether all markers face their sensors at configurations (n, k) and no link hides them."""
-    chain = scene.model.chain
     good = np.ones(len(q), bool)
-    axis = chain.forward(q)[:, :3, 2]
     for sight in sights:
-        to_sensor = sight.sensor_R - chain.positions(q, sight.marker_T)
-        facing = np.sum(axis * to_sensor, axis=-1) / np.linalg.norm(to_sensor, axis=-1)
-        good &= facing >= np.cos(sight.max_angle_rad)
-    for sight in sights:
-        good[good] = ~scene.model.hides(q[good], sight.marker_T, sight.sensor_R)
+        good[good] = ~is_hidden(scene.model, q[good], sight)
     return good
 
 
@@ -517,20 +511,16 @@ def shared_curve(points: FloatArray, travel: TravelTime) -> tuple[FloatArray, Cu
         shares = np.concatenate(([0.0], np.cumsum(times) / times.sum()))
         shares[-1] = 1.0
         try:
-            curve, fastest = travel.curve(points, shares)
+            curve, fastest = travel.curve(points, shares[:-1])
         except ValueError:
             return best
         if best is None or curve.duration_s < best[1].duration_s:
             best = shares, curve, fastest
-        # The rate that each sample allows, as in `Curve.within`.
         at, places = curve.spline.samples
-        first, second = curve.spline.at(at, 1), np.abs(curve.spline.at(at, 2))
-        speeds = np.maximum(travel.speeds.fastest(places, first), 1e-12)
-        first = np.abs(first)
-        a, b = HEADROOM * limits.acceleration, first / RAMP_S
-        rates = np.min(2.0 * a / (b + np.sqrt(b**2 + 4.0 * second * a) + 1e-300), axis=1)
-        rates = np.minimum(rates, HEADROOM / np.max(first / limits.velocity + 1e-12, axis=1))
-        rates = np.minimum(rates, HEADROOM * limits.tool_speed / speeds)
+        speeds = np.maximum(travel.speeds.fastest(places, curve.spline.at(at, 1)), 1e-12)
+        rates = np.minimum(
+            allowed_rates(limits, curve.spline), HEADROOM * limits.tool_speed / speeds
+        )
         begins = np.searchsorted(at, shares[:-1])
         allowed = np.minimum.reduceat(rates, begins)
         times = np.diff(shares) / (allowed**SHIFTED * curve.rate ** (1.0 - SHIFTED))

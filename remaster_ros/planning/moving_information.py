@@ -72,14 +72,11 @@ class MotionRows:
         """Rows of whole tenths of seconds along a curve that begins at a time, s."""
         count = max(int(curve.duration_s / ROW_S), 1)
         t: FloatArray = ROW_S * (np.arange(count, dtype=np.float64) + 0.5)
-        up, down = t, t - RAMP_S - curve.cruise_s
-        speed = np.clip(up / RAMP_S, 0.0, 1.0) - np.clip(down / RAMP_S, 0.0, 1.0)
-        gone = _ramped(up) - _ramped(down)
-        change = (up < RAMP_S).astype(float) - (down > 0.0)
-        share = np.minimum(gone * curve.rate, 1.0)
+        share, rate = np.transpose([curve.share(time_s) for time_s in t.tolist()])
         first, second = curve.spline.at(share, 1), curve.spline.at(share, 2)
-        rate = (speed * curve.rate)[:, None]
-        ramp = (change * curve.rate / RAMP_S)[:, None]
+        begins_s, ends_s = curve.kinks_s
+        change = (t < begins_s).astype(float) - (t > ends_s)
+        rate, ramp = rate[:, None], (change * curve.rate / RAMP_S)[:, None]
         return cls(
             begin_s + t,
             curve.spline.at(share),
@@ -96,12 +93,6 @@ class MotionRows:
             np.concatenate([part.velocity for part in parts]),
             np.concatenate([part.acceleration for part in parts]),
         )
-
-
-def _ramped(t: FloatArray) -> FloatArray:
-    """Integral of a speed that goes from 0 to 1 in `RAMP_S`, s, (n,)."""
-    result: FloatArray = 0.5 * RAMP_S * np.clip(t / RAMP_S, 0.0, 1.0) ** 2
-    return result + np.maximum(t - RAMP_S, 0.0)
 
 
 class MovingInformation:

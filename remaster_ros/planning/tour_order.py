@@ -17,6 +17,7 @@ from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.free_paths import free_path, is_straight_free
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.motion.joint_units import JointUnits
+from remaster_ros.motion.spline import BEGINS_RAD
 from remaster_ros.planning.candidates import Plan, order_solutions
 from remaster_ros.types import FloatArray
 
@@ -55,12 +56,15 @@ class PoseVisit:
     paths: tuple[FloatArray, ...] = ()
     unreached: tuple[int, ...] = ()
     correction: str = ''  # See `PlannedPose`
-    shares: tuple[FloatArray, ...] = ()
+    shares: tuple[FloatArray, ...] = ()  # (0,) each where the path is no curve
 
     def __post_init__(self) -> None:
+        count = len(self.solutions)
         if not self.paths:
             straight = np.empty((0, self.solutions.shape[1]))
-            object.__setattr__(self, 'paths', (straight,) * len(self.solutions))
+            object.__setattr__(self, 'paths', (straight,) * count)
+        if not self.shares:
+            object.__setattr__(self, 'shares', (np.empty(0),) * count)
 
 
 class Tour:
@@ -399,7 +403,7 @@ class Tour:
         pose = self.plans[split].poses[index]
         if pose.way is not None and ids:
             units = JointUnits.of(self.chain)
-            if nearest_solution(pose.way.points[:1], q, units) is not None:
+            if units.largest(pose.way.points[0] - q) <= BEGINS_RAD:
                 return Route(ids, [pose.way.points], (), [pose.way.shares])
         solutions = pose.solutions[ids]
         # Seeded by the pose, so that a tour is repeatable.

@@ -122,10 +122,10 @@ class TravelTime:
     def curve(self, points: FloatArray, shares: FloatArray) -> tuple[Curve, float]:
         """Return the fastest motion along a curve, and its largest point speed, m/s.
 
-        ``points``: with begin and end, (n, k); ``shares``: of the curve, at these, (n,). Raises
-        ValueError as `Spline.through`.
+        ``points``: with begin and end, (n, k); ``shares``: of the curve, at all but the end, which
+        has 1, (n - 1,). Raises ValueError as `Spline.through`.
         """
-        spline = Spline.through(points, shares)
+        spline = Spline.through(points, np.append(shares, 1.0))
         at, places = spline.samples
         peak = float(np.max(self.speeds.fastest(places, spline.at(at, 1))))
         limited = peak if np.isfinite(self.limits.tool_speed) else 0.0

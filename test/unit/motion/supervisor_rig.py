@@ -24,9 +24,8 @@ from remaster_ros.motion.limits import MotionLimits
 from remaster_ros.motion.motion_gate import Cubic, MotionGate
 from remaster_ros.motion.move_queue import PROBE
 from remaster_ros.motion.path_check import FreePath
-from remaster_ros.motion.path_search import BEGINS_RAD
 from remaster_ros.motion.settling import SettleRules
-from remaster_ros.motion.spline import Spline
+from remaster_ros.motion.spline import BEGINS_RAD, Spline
 from remaster_ros.motion.states import Arm
 from remaster_ros.motion.trajectory import Waypoint
 from remaster_ros.simulation import arm_motion as servo

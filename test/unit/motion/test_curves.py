@@ -104,7 +104,7 @@ def test_no_other_curve_is_made(points, shares, why):
 
 
 def cubics(waypoints):
-    """Return what a controller draws between waypoints: start times and cubics."""
+    """Return the start times and cubics of a controller's reference between waypoints."""
     return [(a.time_s, Cubic.between(a, b)) for a, b in pairwise(waypoints)]
 
 
@@ -208,7 +208,7 @@ def test_limits_lowered_since_refuse_the_next_piece():
 
 
 def off_curve(trail):
-    """Return how far the places of a trail are beside the curve at most, rad."""
+    """Return the largest distance of a trail from the curve, in any joint, rad."""
     q, curve = trail[:, 1:3], spline()
     return float(np.max(np.abs(q - curve.at(curve.nearest(q, TURNING)))))
 

@@ -9,7 +9,7 @@ from worlds.simple_cells import write_cell
 
 from remaster_ros.motion.actions import CheckPath
 from remaster_ros.motion.path_check import PointSpeeds
-from remaster_ros.motion.path_search import PathSearch
+from remaster_ros.motion.path_search import PathSearch, beside_chords_m
 from remaster_ros.session.cells.workcell import read_cell
 
 CHAIN = read_cell('demo').chain()
@@ -166,7 +166,7 @@ def test_a_curve_through_an_obstacle_or_too_near_to_it_is_not_gone(scene):
     assert model.path_trouble(path.points) == ''
     np.testing.assert_array_equal(path.points[[0, -1]], [start, target])
     # Between the samples a body may be so far beside the chords, which counts as clearance.
-    assert search.beside_m == model.travel(np.zeros(7), np.full(7, 2e-4)) > 0.0
+    assert beside_chords_m(model) == model.travel(np.zeros(7), np.full(7, 2e-4)) > 0.0
 
 
 def test_an_arm_that_stands_elsewhere_goes_straight(scene):

@@ -197,7 +197,7 @@ def test_a_goal_is_reached_by_what_free_ways_lead_to_alone(few, monkeypatch):
         stop = next_stop(self, q)
         if stop is None or stop.split != 'optimization' or stop.index < few:
             return stop
-        nothing = {'solutions': np.empty((0, len(q))), 'ids': (), 'paths': ()}
+        nothing = {'solutions': np.empty((0, len(q))), 'ids': (), 'paths': (), 'shares': ()}
         return replace(stop, **nothing, unreached=stop.ids)
 
     monkeypatch.setattr(Tour, 'next', lost)

@@ -110,7 +110,7 @@ def test_each_curve_begins_where_the_one_before_ends_with_places_a_second_apart(
         shares = np.append(end.way.shares, 1.0)
         assert end.way.shares[0] == 0.0
         assert np.min(np.diff(shares)) / curve.rate >= 1.0
-        made, _ = travel().curve(np.vstack((end.way.points, end.solutions)), shares)
+        made, _ = travel().curve(np.vstack((end.way.points, end.solutions)), end.way.shares)
         assert made.duration_s == pytest.approx(curve.duration_s)
         (here,) = end.solutions
     assert len(design().ends) + len(design().proof) >= 8
