@@ -800,8 +800,8 @@ def motion_rows(fit: Fit) -> list[tuple[str, str]]:
         rows.append(
             (
                 joint.joint,
-                f'reported {late_words(lag.mean, lag.std)}, beside the mean of all joints; '
-                f'wind-up by friction {scale * abs(windup.mean):.4f} ± {scale * windup.std:.4f} '
+                f'reported {late_words(lag.mean, lag.std)}; wind-up by friction '
+                f'{scale * abs(windup.mean):.4f} ± {scale * windup.std:.4f} '
                 f'{joint.unit}',
             )
         )
