@@ -173,7 +173,8 @@ def friction_share(
 
     After each reversal friction reverses within a travel, (k,), of the joint: in Dahl's model
     (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed exponentially. It
-    is followed along neighbouring rows, and begins at that sign. An arm at rest keeps the share
+    is followed along neighbouring rows, and begins with what the way of a row at its speed leaves:
+    that sign, or nothing of a joint that hardly moves. An arm at rest keeps the share
     that it has come with since its joints ``turned``, (n, k); where that is NaN it is 0.
     """
     moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
@@ -185,7 +186,9 @@ def friction_share(
     share, last = np.sign(velocity[0]), q[0]
     for i in range(len(moments)):
         if gap[i] > LONGEST_GAP_S:
-            share = np.sign(velocity[i] + acceleration[i] * part[0])
+            # Of a joint that has hardly moved nothing is known.
+            begins = velocity[i] + acceleration[i] * part[0]
+            share = np.sign(begins) * -np.expm1(-np.abs(begins) * ROW_S / travel)
             last = q[i] + velocity[i] * part[0]
         total = np.zeros_like(share)
         path = q[i] + np.outer(part, velocity[i]) + 0.5 * np.outer(part**2, acceleration[i])
