@@ -18,7 +18,6 @@ import numpy as np
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.errors import InputError, InsufficientDataError
 from remaster_ros.kinematics.body_pairs import RESERVE_M
-from remaster_ros.kinematics.free_paths import is_straight_free
 from remaster_ros.linear_algebra import one_thread
 from remaster_ros.motion.path_search import beside_chords_m
 from remaster_ros.motion.spline import STRAIGHT_SHARE
@@ -45,22 +44,18 @@ from remaster_ros.types import BoolArray, FloatArray
 
 MOVING_S = 40.0
 """Default time of measured motion, s."""
-SHORTEST_MOVING_S, LONGEST_MOVING_S = 12.0, 600.0
-"""Least and most time of measured motion, s: two curves, and ten minutes."""
-CURVE_S = 8.0
-"""Time of a curve that is aimed at, s: an interruption loses no more."""
-SHORTEST_S, LONGEST_S = 6.0, 12.0
-"""Least and most time of a curve, s."""
+PROOF_POSES = 8
+"""Least number of curves: each ends at a pose at standstill that proves the fit."""
+SHORTEST_S, CURVE_S, LONGEST_S = 3.0, 10.0, 12.0
+"""Time of a curve, s: the least, that which is aimed at with more curves, and the most. An
+interruption loses no more than that of a curve."""
+SHORTEST_MOVING_S, LONGEST_MOVING_S = PROOF_POSES * SHORTEST_S, 600.0
+"""Least and most time of measured motion, s."""
 APART_S = 1.0
 """Least time between two places of a curve, s: the bridge replaces pieces of curves, of which each
 needs time to be sent."""
 NEAR_S, FAR_S, FEWEST_NEAR = 0.6, 3.0, 10
 """Times between which the next place of a curve is, s; of how many nearest if there is none."""
-PROOF_APART_S, PROOF_DRAWN = 1.2, 40
-"""Least time from one pose of the proof to the others, s; number of poses that are drawn, of which
-the nearest is taken."""
-PROOF_POSES = 8
-"""Least number of poses measured at standstill that prove the fit."""
 FEWEST_MARKERS = 4
 """Fewest markers of a sensor: with one the same precision takes many times as long."""
 POOL_CANDIDATES, DRAWN, POOL, FEWEST_POOL = 200, 20_000, 600, 30
@@ -91,7 +86,6 @@ class MovingDesign:
     begin: PlannedPose
     # Each with its way from the end of the one before
     ends: tuple[PlannedPose, ...]
-    proof: tuple[PlannedPose, ...]  # Further poses that are measured at standstill, in order
     curves: tuple[Curve, ...]
     rows: MotionRows  # Of all curves
     expected: MovingExpected
@@ -209,7 +203,7 @@ def stays_in_sight(
 ) -> bool:
     """Whether sensors at these positions in R, m, (3,), see every marker all along the curves."""
     sights = sights_of(scene, settings.with_sensors_at(sensors_R).sensors)
-    ends = np.array([pose.solutions[0] for pose in (design.begin, *design.ends, *design.proof)])
+    ends = np.array([pose.solutions[0] for pose in (design.begin, *design.ends)])
     places = [ends, *map(_fine, design.curves)]
     return bool(np.all(in_sight(scene, sights, np.concatenate(places))))
 
@@ -231,7 +225,8 @@ class _Search:
         self._scene, self._rng, self._moving_s = scene, rng, moving_s
         self._model, self._chain = scene.model, scene.model.chain
         self._limits = travel.limits
-        self._curves = max(2, round(moving_s / CURVE_S))
+        self._curves = max(PROOF_POSES, round(moving_s / CURVE_S))
+        self._curve_s = moving_s / self._curves
         self._margin = scene.limit_margin_rad * self._chain.per_radian
         self._extra = beside_chords_m(self._model)
         self._sights = sights_of(scene, sensors)
@@ -318,13 +313,13 @@ class _Search:
     def _first_piece(self) -> _Piece | None:
         """Draw a curve from where the one before ends; None if none is found."""
         here = self._pieces[-1].points[-1] if self._pieces else self._pool[0]
-        count = round(self._moving_s / self._curves / BETWEEN_S)
+        count = round(self._curve_s / BETWEEN_S)
         for attempt in range(TRIES):
             places = [here]
             # The fewer places, the more curves are short enough.
             for _ in range(max(2, count - attempt * count // TRIES)):
                 places.append(self._near(places[-1], None))
-            piece = self.piece(np.array(places), len(self._pieces) * CURVE_S)
+            piece = self.piece(np.array(places), len(self._pieces) * self._curve_s)
             if piece is not None and self._is_free(piece):
                 return piece
         return None
@@ -384,7 +379,7 @@ class _Search:
                 changed[number + 1] = _with(self._pieces[number + 1].points, 0, new)
         pieces = list(self._pieces)
         for index, places in changed.items():
-            piece = self.piece(places, index * CURVE_S)
+            piece = self.piece(places, index * self._curve_s)
             if piece is None:
                 return
             pieces[index] = piece
@@ -433,7 +428,6 @@ class _Search:
         return MovingDesign(
             begin,
             tuple(ends),
-            tuple(self._pose(q) for q in self._proof(pieces[-1].points[-1], len(ends))),
             curves,
             rows,
             expected,
@@ -443,24 +437,6 @@ class _Search:
             max(piece.tool_speed_m_s for piece in pieces),
             float(np.mean(self.seen(np.concatenate([_fine(curve) for curve in curves])))),
         )
-
-    def _proof(self, here: FloatArray, so_far: int) -> list[FloatArray]:
-        """Further configurations to measure at standstill, each a straight free line away."""
-        chosen: list[FloatArray] = []
-        while so_far + len(chosen) < PROOF_POSES:
-            # The nearest of some that differ.
-            apart = np.min([self._times(each) for each in (here, *chosen)], axis=0)
-            some = self._rng.permutation(np.flatnonzero(apart > PROOF_APART_S))[:PROOF_DRAWN]
-            near = some[np.argsort(self._times(here)[some])]
-            free = (
-                self._pool[i] for i in near if is_straight_free(self._model, here, self._pool[i])
-            )
-            found = next(free, None)
-            if found is None:
-                break
-            chosen.append(found)
-            here = found
-        return chosen
 
     def _pose(self, q: FloatArray) -> PlannedPose:
         return PlannedPose(self._chain.forward(q), q[None])

@@ -247,7 +247,7 @@ class TourPlanner:
         ):
             design = self._curves(sensors_R)
         self.moving_design = design
-        held_out = Plan((*design.ends, *design.proof))
+        held_out = Plan(design.ends)
         return Tour(
             self._chain,
             {FITTED: Plan((design.begin,)), HELD_OUT: held_out},

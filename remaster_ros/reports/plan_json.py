@@ -69,7 +69,7 @@ def _moving(plan: CollectionPlan, design: MovingDesign) -> dict[str, Any]:
         'moving_s': round(design.moving_s, 2),
         'curves_s': [round(curve.duration_s, 2) for curve in design.curves],
         'configurations': sum(len(end.way.points) for end in design.ends if end.way) + 1,
-        'proof_poses': len(design.ends) + len(design.proof),
+        'proof_poses': len(design.ends),
         'share_in_sight': round(design.share_in_sight, 4),
         'fastest_joint': chain.joint_names[joint],
         'max_joint_speed_deg_s': round(float(np.degrees(speed)), 2),

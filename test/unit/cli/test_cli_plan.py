@@ -164,10 +164,10 @@ def test_without_look_alikes_there_is_nothing_to_separate(tmp_path):
 
 def test_measured_motion_is_planned_and_said(tmp_path):
     cell = four_markers(tmp_path / 'cell.yaml', poses={'joint_std_deg': 0.0005})
-    found = as_json(cell, '--moving', 14)
+    found = as_json(cell, '--moving', 24)
     moving = found['moving']
     assert moving['moving_s'] == pytest.approx(sum(moving['curves_s']), abs=0.1)
-    assert len(moving['curves_s']) == 2
+    assert len(moving['curves_s']) == 8
     assert moving['share_in_sight'] > 0.99
     assert moving['max_joint_share'] <= 1.0
     assert moving['max_tool_speed_m_s'] <= 0.25
@@ -178,10 +178,10 @@ def test_measured_motion_is_planned_and_said(tmp_path):
     assert 0.0 < found['expected_std_deg']['joint_2'] < 0.05
     assert moving['expected_rms_std_own_deg'] > 1.5 * found['expected_rms_std_deg']
     assert found['goal'] is None
-    out, err = remaster('plan', cell, '--moving', 14)
+    out, err = remaster('plan', cell, '--moving', 24)
     assert err == ''
     for words in (
-        f'to fit: {moving["moving_s"]:.1f} s of motion, measured all along: 2 curves',
+        f'to fit: {moving["moving_s"]:.1f} s of motion, measured all along: 8 curves',
         'held out: 8 configurations at 8 poses, measured at standstill',
         f'robot time of the whole session: {found["robot_time_s"]:.0f} s',
         'every marker in sight: 100 % of the measured motion',

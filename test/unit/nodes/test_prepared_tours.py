@@ -16,7 +16,7 @@ from remaster_ros.session.cells.workcell import read_cell
 
 def test_a_tour_that_is_asked_for_waits_for_what_is_prepared(tmp_path, monkeypatch):
     cell = read_cell(four_markers(tmp_path / 'cell.yaml'))
-    tours = Parameters(moving_s=14.0).tour_planner(cell, cell.chain(), ())
+    tours = Parameters(moving_s=24.0).tour_planner(cell, cell.chain(), ())
     began, may_end, done = threading.Event(), threading.Event(), []
 
     def prepare(self):

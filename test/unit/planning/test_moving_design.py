@@ -47,7 +47,7 @@ def travel():
     return TravelTime.of(scene().model, 0.3, TOOL_SPEED, limits)
 
 
-def designed(seed, exchanges=FEW, seconds=14.0):
+def designed(seed, exchanges=FEW, seconds=24.0):
     settings = cell().design_settings()
     rng = np.random.default_rng(seed)
     return design_moving(
@@ -71,7 +71,7 @@ def test_curves_keep_limits_clearance_and_sight_at_any_time():
     markers = np.array(list(sensor.markers.values()))
     margin = scene().limit_margin_rad
     for curve in design().curves:
-        assert 6.0 - 1e-9 <= curve.duration_s <= 12.0
+        assert 3.0 - 0.3 <= curve.duration_s <= 12.0
         times = random_times(curve, 500, rng)
         q = np.array([curve.at(t)[0] for t in times])
         after = np.array([curve.at(min(t + h, curve.duration_s))[0] for t in times])
@@ -113,7 +113,7 @@ def test_each_curve_begins_where_the_one_before_ends_with_places_a_second_apart(
         made, _ = travel().curve(np.vstack((end.way.points, end.solutions)), end.way.shares)
         assert made.duration_s == pytest.approx(curve.duration_s)
         (here,) = end.solutions
-    assert len(design().ends) + len(design().proof) >= 8
+    assert len(design().ends) == 8
 
 
 def variance(rows):
@@ -153,9 +153,9 @@ def moved(found):
 def test_information_a_second_beats_random_curves_and_straight_lines():
     by_curves, by_lines = [], []
     for seed in range(5):
-        found, drawn = designed(seed), designed(seed, exchanges=0, seconds=28.0)
+        found, drawn = designed(seed), designed(seed, exchanges=0, seconds=40.0)
         # As many seconds of each; more is drawn than that.
-        assert found.moving_s < 15.0 < drawn.moving_s
+        assert found.moving_s < 25.0 < drawn.moving_s
         own, rows = variance(moved(found)), (moved(drawn), along_lines(drawn))
         of_drawn, of_lines = (variance(until(each, found.moving_s)) for each in rows)
         by_curves.append(of_drawn / own)
@@ -186,7 +186,7 @@ def test_the_same_seed_gives_the_same_curves():
     assert first.rows.q.shape != other.rows.q.shape or np.any(first.rows.q != other.rows.q)
 
 
-def planner_of(seed=0, seconds=14.0):
+def planner_of(seed=0, seconds=24.0):
     settings = cell().design_settings()
     return TourPlanner(scene(), COUNTS, seed, 25, settings, travel(), (), seconds)
 
@@ -199,10 +199,10 @@ def test_a_session_goes_curve_by_curve_and_ends_with_its_proof(monkeypatch):
     assert splits == ['registration'] * 3 + [FITTED] + [HELD_OUT] * 8
     assert [visit.pose for visit in plan.visits[4:]] == list(range(8))
     assert [visit.trajectory.is_curve for visit in plan.visits] == (
-        [False] * 4 + [True] * 2 + [False] * 6
+        [False] * 4 + [True] * 8
     )
     curves = planner.moving_design.curves
-    for visit, curve in zip(plan.visits[4:6], curves, strict=True):
+    for visit, curve in zip(plan.visits[4:], curves, strict=True):
         assert visit.trajectory.duration_s == pytest.approx(curve.duration_s)
     for before, after in zip(plan.visits, plan.visits[1:], strict=False):
         np.testing.assert_allclose(after.trajectory.start, before.q)
@@ -266,5 +266,5 @@ def test_sensors_that_cannot_are_refused_with_a_remedy(changes, words):
 
 @pytest.mark.parametrize('seconds', [3.0, 2000.0, np.nan])
 def test_a_time_out_of_range_is_refused(seconds):
-    with pytest.raises(InputError, match='give 12 to 600 s'):
+    with pytest.raises(InputError, match='give 24 to 600 s'):
         designed(0, seconds=seconds)

@@ -151,12 +151,12 @@ def test_a_curve_is_played_as_it_is_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(
         plan_verb, 'plan_page', lambda plan, *args: plans.append(plan) or drawn(plan, *args)
     )
-    assert cli.main(['plan', str(cell), '--moving', '14', '--quiet', '--out', str(path)]) == 0
+    assert cli.main(['plan', str(cell), '--moving', '24', '--quiet', '--out', str(path)]) == 0
     (plan,) = plans
     before = [visit.trajectory.duration_s + plan.measuring_s for visit in plan.visits[:4]]
-    since = np.array([1.23, 4.56])
+    since = np.array([1.23, 2.34])
     page = Page(path.read_text(encoding='utf-8'))
-    assert 's of motion along 2 curves are measured all along, with every marker' in page.text
+    assert 's of motion along 8 curves are measured all along, with every marker' in page.text
     found = seen(
         path,
         """
