@@ -198,9 +198,7 @@ def test_a_session_goes_curve_by_curve_and_ends_with_its_proof(monkeypatch):
     splits = [visit.split for visit in plan.visits]
     assert splits == ['registration'] * 3 + [FITTED] + [HELD_OUT] * 8
     assert [visit.pose for visit in plan.visits[4:]] == list(range(8))
-    assert [visit.trajectory.is_curve for visit in plan.visits] == (
-        [False] * 4 + [True] * 8
-    )
+    assert [visit.trajectory.is_curve for visit in plan.visits] == ([False] * 4 + [True] * 8)
     curves = planner.moving_design.curves
     for visit, curve in zip(plan.visits[4:], curves, strict=True):
         assert visit.trajectory.duration_s == pytest.approx(curve.duration_s)
