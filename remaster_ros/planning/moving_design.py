@@ -54,6 +54,8 @@ SHORTEST_MOVING_S, LONGEST_MOVING_S = PROOF_POSES * SHORTEST_S, 600.0
 APART_S = 1.0
 """Least time between two places of a curve, s: the bridge replaces pieces of curves, of which each
 needs time to be sent."""
+SOME = 60
+"""Number of configurations among which the next place of a curve is looked for."""
 NEAR_S, FAR_S, FEWEST_NEAR = 0.6, 3.0, 10
 """Times between which the next place of a curve is, s; of how many nearest if there is none."""
 FEWEST_MARKERS = 4
@@ -108,6 +110,7 @@ class _Piece:
     points: FloatArray  # With begin and end, (n, k)
     shares: FloatArray
     curve: Curve
+    q: FloatArray  # Of its rows, (n, k)
     tool_speed_m_s: float  # Largest speed of a point
     information: FloatArray
 
@@ -280,7 +283,10 @@ class _Search:
         return in_sight(self._scene, self._sights, q)
 
     def piece(self, points: FloatArray, begin_s: float) -> _Piece | None:
-        """Curve through configurations (n, k) and its information; None if it is not allowed."""
+        """Curve through configurations (n, k), if within limits, and its information; else None.
+
+        Whether it is free and in sight takes longer, see `_is_free`.
+        """
         found = shared_curve(points, self._travel)
         if found is None:
             return None
@@ -291,9 +297,7 @@ class _Search:
         if not np.all(self._chain.within_limits(places, -self._margin)):
             return None
         rows = MotionRows.of(curve, begin_s)
-        if not self.seen(rows.q).all() or not self._model.free_mask(rows.q, RESERVE_M).all():
-            return None
-        return _Piece(points, shares, curve, fastest, self._information.of(rows))
+        return _Piece(points, shares, curve, rows.q, fastest, self._information.of(rows))
 
     def begin(self) -> None:
         """Draw the first curves; raise InsufficientDataError if none are found."""
@@ -325,21 +329,21 @@ class _Search:
         return None
 
     def _is_free(self, piece: _Piece) -> bool:
+        """Whether the arm is free and every marker in sight all along."""
+        if not self._model.free_mask(piece.q, RESERVE_M).all() or not self.seen(piece.q).all():
+            return False
         return not self._model.path_trouble(piece.curve.spline.samples[1], self._extra)
 
     def _near(self, here: FloatArray, there: FloatArray | None) -> FloatArray:
         """Draw a configuration of the pool that is some seconds from one, or from two others."""
-        times = self._times(here)
-        if there is not None:
-            times = np.maximum(times, self._times(there))
+        some = self._rng.permutation(self._pool)[:SOME]
+        ends = [here] if there is None else [here, there]
+        # At full speed along straight lines.
+        times = np.max([self._travel.straight(each, some) - RAMP_S for each in ends], axis=0)
         near = np.flatnonzero((times < FAR_S) & (times > NEAR_S))
         if not len(near):
             near = np.argsort(times)[1 : 1 + FEWEST_NEAR]
-        return self._pool[int(self._rng.choice(near))]
-
-    def _times(self, here: FloatArray) -> FloatArray:
-        """Times to the pool's configurations at full speed along straight lines, s, (n,)."""
-        return self._travel.straight(here, self._pool) - RAMP_S
+        return some[int(self._rng.choice(near))]
 
     def _cost_of(self, pieces: Sequence[_Piece]) -> float:
         total = np.sum([piece.information for piece in pieces], axis=0)
