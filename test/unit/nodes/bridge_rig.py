@@ -18,7 +18,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rigs.ros_rig import OWN_DOMAIN
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String
+from std_msgs.msg import Bool, Header, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -34,6 +34,8 @@ from remaster_ros.collection.events import (
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.motion.states import Arm
 from remaster_ros.nodes import rivals, robot_bridge, simulated_clock, status
+from remaster_ros.nodes.messages import waypoints_message
+from remaster_ros.planning.tour_order import PoseVisit
 from remaster_ros.session.bridge_files import LastCommandFile
 from remaster_ros.session.cells.workcell import read_cell
 
@@ -408,6 +410,26 @@ class Rig:
         self.taken(self.solutions, message, 'solutions')
         self.flush()
         return f'{self.pose}.000000000'
+
+    def plan_curve(self, spline_points, shares):
+        """Publish a pose that is reached by a curve through these points; returns its stamp."""
+        *through, target = spline_points
+        visit = PoseVisit(
+            0,
+            'validation',
+            np.eye(4),
+            target[None],
+            0,
+            (0,),
+            (np.array(through),),
+            shares=(shares[:-1],),
+        )
+        self.pose += 1
+        header = Header(stamp=stamp(self.pose))
+        self.taken(self.ways, waypoints_message(visit, self.names, header), 'ways')
+        message = JointTrajectory(header=header, joint_names=self.names, points=[point(target)])
+        self.taken(self.solutions, message, 'solutions')
+        self.flush()
 
     def answer(self, stamp_key, solution):
         self.say(ConfigurationEnded(stamp=stamp_key, solution=solution, result='recorded'))

@@ -16,6 +16,10 @@ from bridge_rig import HOME
 from std_msgs.msg import String
 from test_bridge_action import ActionRig
 
+from remaster_ros.collection.events import ArmStopped, SolutionFailed
+from remaster_ros.motion.joint_units import TURNING
+from remaster_ros.motion.motion_gate import NO_STAMPS
+from remaster_ros.motion.spline import Spline
 from remaster_ros.nodes import controller_link
 from remaster_ros.session.bridge_files import LastCommandFile
 
@@ -124,6 +128,78 @@ def test_a_bridge_that_is_gone_leaves_an_arm_that_stands_soon_where_the_next_one
     r.wall += 2.0
     r.say_planner('paused')
     r.run(3.0)
+
+
+def bent(seed=5):
+    """Return configurations about HOME for a curve, (9, k), and their shares."""
+    print(f'seed {seed}')
+    points = HOME + 0.1 * np.random.default_rng(seed).normal(size=(9, 7))
+    return np.vstack((HOME, points[1:])), np.linspace(0.0, 1.0, 9)
+
+
+def off_curve(r, points, shares, since=0):
+    """Return how far the arm was from the curve at most, rad, since a row of its history."""
+    curve = Spline.through(points, shares)
+    been = np.array([q for _, q, _ in r.arm.history])[since:]
+    return np.max(np.abs(been - curve.at(curve.nearest(been, TURNING))))
+
+
+def test_a_curve_is_gone_in_pieces_and_a_stop_stays_on_it(pieces):
+    """By the topic and by the action; what is left of it is a line to its end."""
+    points, shares = bent()
+    r = pieces(trajectory_stamps='kept')
+    on_one_clock(r)
+    r.plan_curve(points, shares)
+    r.run(60.0, lambda: r.settled)
+    np.testing.assert_allclose(r.settled[0].position, points[-1], atol=1e-4)
+    assert off_curve(r, points, shares) < 0.01
+    count = len(r.commands)
+    assert count > 10
+    # Back, and stopped on its way.
+    back = points[::-1]
+    began = len(r.arm.history)
+    r.plan_curve(back, shares)
+    r.run(20.0, lambda: r.arm.speed() > 0.05)
+    r.run(2.0)
+    r.say_planner('paused')
+    r.run(1.5)
+    assert [stop.reason for stop in r.named(ArmStopped)] == ['planner is paused']
+    assert r.arm.speed() < STANDS_RAD_S
+    assert off_curve(r, back, shares, began) < 0.01
+    assert np.max(np.abs(r.arm.q - back[-1])) > 0.05
+    assert not r.halted()
+    if isinstance(r, ActionRig):
+        assert r.controller.cancelled == 0
+    r.say_planner('running')
+    r.run(60.0, lambda: len(r.settled) == 2)
+    np.testing.assert_allclose(r.settled[1].position, back[-1], atol=1e-4)
+
+
+def test_an_emergency_stop_on_a_curve_halts(pieces):
+    points, shares = bent()
+    r = pieces(trajectory_stamps='kept')
+    on_one_clock(r)
+    r.plan_curve(points, shares)
+    r.run(20.0, lambda: r.arm.speed() > 0.05)
+    r.arm.stop_by_brakes(r.wall)
+    r.run(3.0, r.halted)
+    sent = r.bridge.published
+    r.run(2.0)
+    assert r.bridge.published == sent
+    if isinstance(r, ActionRig):
+        assert r.controller.cancelled == 1
+
+
+def test_a_controller_without_stamps_gets_no_curve(pieces):
+    points, shares = bent()
+    r = pieces(trajectory_stamps='ignored')
+    on_one_clock(r)
+    r.plan_curve(points, shares)
+    r.run(3.0)
+    assert not r.settled
+    assert not r.moves()
+    (failed,) = r.named(SolutionFailed)
+    assert NO_STAMPS in failed.reason
 
 
 def test_a_controller_is_known_by_its_state(rig, monkeypatch):
