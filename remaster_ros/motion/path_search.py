@@ -44,14 +44,12 @@ class PathSearch:
         curve = self._curve(request)
         if curve is not None:
             return PathAnswer(curve)
-        # Of a curve that is not gone the places are hints, but for its beginning: there it stands.
-        curved = len(request.shares) > 0
-        hints = list(request.waypoints[1 if curved else 0 :])
-        points = np.vstack([request.start, *([] if curved else hints), request.target])
+        waypoints = request.waypoints[: 0 if len(request.shares) else None]
+        points = np.vstack([request.start, waypoints, request.target])
         trouble = self._model.path_trouble(points)
         if not trouble:
             return PathAnswer(self._path(points))
-        found = free_path(self._model, request.start, request.target, rng, hints=hints)
+        found = free_path(self._model, request.start, request.target, rng, hints=list(waypoints))
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
 
     def _curve(self, request: CheckPath) -> FreePath | None:

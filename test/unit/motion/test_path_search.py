@@ -165,9 +165,6 @@ def test_a_curve_through_an_obstacle_or_too_near_to_it_is_not_gone(scene):
     assert path.curve is None
     assert model.path_trouble(path.points) == ''
     np.testing.assert_array_equal(path.points[[0, -1]], [start, target])
-    # The beginning of the curve is no place to go through: the arm stands there.
-    near = on_curve(search, start + 1e-6, [start, turned(-0.4), turned(0.4)], target).path
-    assert np.min(np.max(np.abs(np.diff(near.points, axis=0)), axis=1)) > 0.01
     # Between the samples a body may be so far beside the chords, which counts as clearance.
     assert beside_chords_m(model) == model.travel(np.zeros(7), np.full(7, 2e-4)) > 0.0
 
