@@ -4,15 +4,22 @@
 import pytest
 from rigs.collection_rig import Cell
 from rigs.ros_rig import call
-from worlds.simple_cells import write_cell
+from worlds.simple_cells import four_markers, write_cell
 
 pytestmark = [pytest.mark.ros, pytest.mark.qualify, pytest.mark.timeout(900)]
 
 
-def test_nothing_moves_before_each_plan_is_confirmed(start, client, tmp_path):
-    """The registration, then the collection, then the same one with a planner started again."""
-    path = write_cell(tmp_path / 'cell.yaml', confirm=True)
-    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], cell=path, collect=False)
+@pytest.mark.parametrize('moving_s', [0.0, 24.0])
+def test_nothing_moves_before_each_plan_is_confirmed(start, client, tmp_path, moving_s):
+    """The registration, then the collection, then the same one with a planner started again.
+
+    From pose to pose, and along curves at the pace of a real arm.
+    """
+    writes = four_markers if moving_s else write_cell
+    path = writes(tmp_path / 'cell.yaml', confirm=True)
+    # Stamps of another pace are further from the bridge's clock than curves allow.
+    options = {'rate': 1.0, 'judged': {'moving_s': moving_s}} if moving_s else {}
+    cell = Cell(start, client, tmp_path, 'mocap', ['mocap'], cell=path, collect=False, **options)
     page = tmp_path / 'session.plan.html'
     confirmed = []
 
@@ -39,7 +46,7 @@ def test_nothing_moves_before_each_plan_is_confirmed(start, client, tmp_path):
         assert commanded() == before
         assert planner('state') != 'running'
         answer = call(client, '/remaster/confirm')
-        assert answer.success
+        assert answer.success, answer.message
         assert answer.message.startswith(f'plan {plan} is confirmed')
         confirmed.append(plan)
         answer = call(client, '/remaster/collect')
