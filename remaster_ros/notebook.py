@@ -29,7 +29,7 @@ class Fit(FitResult):
     @classmethod
     def of(cls, result: FitResult) -> Fit:
         """Return a result as one that shows itself."""
-        return cls(**{one.name: getattr(result, one.name) for one in fields(result)})
+        return cls(**{field.name: getattr(result, field.name) for field in fields(result)})
 
     @cached_property
     def joint_offsets_std_shown(self) -> FloatArray:
@@ -85,7 +85,7 @@ class Found(Discovery):
     @classmethod
     def of(cls, found: Discovery) -> Found:
         """Return a result as one that shows itself."""
-        return cls(**{one.name: getattr(found, one.name) for one in fields(found)})
+        return cls(**{field.name: getattr(found, field.name) for field in fields(found)})
 
     def __repr__(self) -> str:
         from remaster_ros.reports.sentences import discovery_lines

@@ -399,9 +399,9 @@ def linear_fit(
     base = np.linalg.svd(np.column_stack((centred, np.ones(n))), full_matrices=False)[0]
     tools = chain.forward(q)
     flat = tools[..., :3, :].reshape(len(q), n, 12)
-    left = (flat - base @ (base.T @ flat)).reshape(len(q), n, 3, 4)
-    design = left[..., :3].reshape(len(q), 3 * n, 3)
-    target = -left[..., 3].reshape(len(q), 3 * n, 1)
+    complement = (flat - base @ (base.T @ flat)).reshape(len(q), n, 3, 4)
+    design = complement[..., :3].reshape(len(q), 3 * n, 3)
+    target = -complement[..., 3].reshape(len(q), 3 * n, 1)
     by_marker = np.swapaxes(design, 1, 2)
     normal = by_marker @ design
     # If the tool hardly turns, the marker is not determined, and stays near the tool.
@@ -484,14 +484,14 @@ def within_limits(
     low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD
     quarters = list(arrangement.quarters)
     for joint, turn in enumerate(quarters):
-        whole = [
+        whole_turns = [
             turns
             for turns in ((0, -4, 4) if turn else (0,))
             if low[joint] + turns * _QUARTER >= chain.lower[joint]
             and high[joint] + turns * _QUARTER <= chain.upper[joint]
         ]
-        if whole:
-            quarters[joint] += whole[0]
+        if whole_turns:
+            quarters[joint] += whole_turns[0]
         # Angles from 0 to 360 degrees take a turn off some rows alone.
         elif not keeps_limits(chain, chain.within_turns(q)[:, joint], joint):
             return None
@@ -542,13 +542,26 @@ def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
     """
     plain = Arrangement.given(joints)
     signs = list(product((1, -1), repeat=joints))
-    yield 0, [replace(plain, signs=some, angle_scale=by) for by in _SCALES for some in signs]
-    yield 0, [replace(plain, order=way, signs=some) for way in _orders(joints) for some in signs]
-    yield 0, [replace(plain, signs=some, quarters=by) for by in _turns(joints) for some in signs]
+    yield 0, [replace(plain, signs=pattern, angle_scale=by) for by in _SCALES for pattern in signs]
+    yield (
+        0,
+        [replace(plain, order=way, signs=pattern) for way in _orders(joints) for pattern in signs],
+    )
+    yield (
+        0,
+        [replace(plain, signs=pattern, quarters=by) for by in _turns(joints) for pattern in signs],
+    )
     if joints > 2:
-        yield 0, [replace(plain, signs=some, coupled=share) for share in (1, -1) for some in signs]
+        yield (
+            0,
+            [
+                replace(plain, signs=pattern, coupled=share)
+                for share in (1, -1)
+                for pattern in signs
+            ],
+        )
     for shift in (-1, 1):
-        yield shift, [replace(plain, signs=some) for some in signs]
+        yield shift, [replace(plain, signs=pattern) for pattern in signs]
 
 
 def _orders(joints: int) -> Iterable[tuple[int, ...]]:

@@ -143,8 +143,13 @@ class MotionColumns:
         tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
         frame = self.links.point_acceleration(tool[:, :3, 3])
         turning = self.links.point_acceleration(apply(tool, middle)) - frame
-        along = [np.einsum('nia,ni->na', tool[:, :3, :3], one) for one in (frame, turning)]
-        return np.concatenate([-tool[:, :3, :3] * one[:, None, :] for one in along], axis=2)
+        along = [
+            np.einsum('nia,ni->na', tool[:, :3, :3], acceleration)
+            for acceleration in (frame, turning)
+        ]
+        return np.concatenate(
+            [-tool[:, :3, :3] * acceleration[:, None, :] for acceleration in along], axis=2
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +248,7 @@ def dynamic_extension(
     lags = []
     for joint in range(k):
         per = float(chain.per_radian[joint])
-        own = chain.units[joint]
+        joint_unit = chain.units[joint]
         lags.append(len(names))
         terms.append(
             Term(
@@ -253,12 +258,12 @@ def dynamic_extension(
             )
         )
         for name, friction in zip(('windup', 'late_windup'), columns.friction, strict=True):
-            where = named(f'{name}_{joint + 1}', own, WINDUP_STD_RAD * per)
+            where = named(f'{name}_{joint + 1}', joint_unit, WINDUP_STD_RAD * per)
             terms.append(Term(where, joint, friction[:, joint, None]))
         if chain.has_inertials:
             where = named(
                 f'inertia_{joint + 1}',
-                f'{own}/{chain.torque_units[joint]}',
+                f'{joint_unit}/{chain.torque_units[joint]}',
                 SOFTNESS_STD * per**2,
             )
             terms.append(Term(where, joint, columns.inertial_torque[:, joint, None]))

@@ -301,10 +301,10 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
         if found is not None and np.array_equal(found[0], keep):
             return found[1]
         # From the mode of the rows kept before: only the first search has far to go.
-        near = z if found is None else found[1].z
+        guess = z if found is None else found[1].z
         # Of a reading, position and orientation are kept or neither.
         kept = model.rows_of_path(measurements, np.setdiff1d(rows.source, rows.source[~keep]))
-        found = keep, find_mode(Posterior.of(model, kept, priors, free, near))
+        found = keep, find_mode(Posterior.of(model, kept, priors, free, guess))
         return found[1]
 
     def refit(keep: BoolArray) -> FloatArray:
@@ -415,12 +415,12 @@ def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
     joints = posterior.model.joints
     natural = posterior.model.natural(mode.z)
     natural[:joints] = joint_offsets
-    held = replace(
+    fixed_posterior = replace(
         posterior,
         free=posterior.free[posterior.free >= joints],
         reference=posterior.model.pinned(natural),
     )
-    return find_mode(held)
+    return find_mode(fixed_posterior)
 
 
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:

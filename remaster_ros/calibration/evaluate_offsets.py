@@ -121,17 +121,17 @@ def _draws(
     joints = np.arange(1, model.joints - 1)
     # In pinned coordinates the outer two joints move nothing.
     joints = joints[joint_offsets_std[joints] > 0.0]
-    others = np.arange(model.joints, model.size)
+    nuisance = np.arange(model.joints, model.size)
     everything = replace(found.posterior, free=np.arange(model.size), reference=given.z)
     information = linearise(everything, given.z).gram(given.eta)[:-1, :-1]
-    scale = 1.0 / np.sqrt(np.diag(information)[others])
-    factor = np.linalg.cholesky(information[np.ix_(others, others)] * np.outer(scale, scale))
+    scale = 1.0 / np.sqrt(np.diag(information)[nuisance])
+    factor = np.linalg.cholesky(information[np.ix_(nuisance, nuisance)] * np.outer(scale, scale))
 
     shift = joint_offsets_std[joints] * rng.standard_normal((DRAWS, len(joints)))
-    pull = shift @ (information[np.ix_(joints, others)] * scale)
-    noise = rng.standard_normal((DRAWS, len(others)))
+    pull = shift @ (information[np.ix_(joints, nuisance)] * scale)
+    noise = rng.standard_normal((DRAWS, len(nuisance)))
     answer = np.linalg.solve(factor.T, noise.T - np.linalg.solve(factor, pull.T)).T * scale
     draws = np.tile(given.z, (DRAWS, 1))
     draws[:, joints] += shift
-    draws[:, others] += answer
+    draws[:, nuisance] += answer
     return draws

@@ -124,8 +124,8 @@ def combination_text(model: Model, direction: FloatArray) -> str:
 def _shortened(parts: Sequence[str]) -> str:
     """Parts as a list in words; of more than 20 (`MOST_LISTED`) the first 5 and 'n more'."""
     if len(parts) > MOST_LISTED:
-        others = len(parts) - MOST_NAMED
-        return listed([*parts[:MOST_NAMED], f'{others} more'])
+        excess = len(parts) - MOST_NAMED
+        return listed([*parts[:MOST_NAMED], f'{excess} more'])
     return listed(parts)
 
 
@@ -187,8 +187,8 @@ def resolving_priors(
     core = replace(model, extension=None)
     names = [*(prior.description for prior in priors), EFFECTS_PRIOR]
     rows = [prior_rows(core, [prior], x[: model.core], natural=True)[1] for prior in priors]
-    pulls = [np.linalg.norm(one @ directions[: model.core], axis=0) for one in rows]
+    pulls = [np.linalg.norm(row @ directions[: model.core], axis=0) for row in rows]
     effects = model.extension_root @ model.theta(directions.T).T
     holds = np.array([*pulls, np.linalg.norm(effects, axis=0)])
     holds = holds > 1e-3 * holds.max(axis=0)
-    return [listed(list(dict.fromkeys(compress(names, one)))) for one in holds.T]
+    return [listed(list(dict.fromkeys(compress(names, row)))) for row in holds.T]

@@ -69,8 +69,8 @@ def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float,
         # Trapezoids: half weights at both ends.
         weight = np.full(POINTS, edges[1] - edges[0])
         weight[[0, -1]] *= 0.5
-        away = (edges[:, None] - grid) / width
-        density = weight * (np.exp(-0.5 * away**2) @ density) / (np.sqrt(2.0 * np.pi) * width)
+        deviation = (edges[:, None] - grid) / width
+        density = weight * (np.exp(-0.5 * deviation**2) @ density) / (np.sqrt(2.0 * np.pi) * width)
         grid = edges
     return tuple(limits)
 

@@ -195,11 +195,11 @@ class Rows:
         size = self.frame_size[:, None].astype(flat.dtype)
         means = self.frame_sum(flat) / size
         differences = flat - np.repeat(means, self.frame_size, axis=0)
-        for one in self.decorrelation:
-            for frames, factor, markers in one.runs:
+        for decorrelation in self.decorrelation:
+            for frames, factor, markers in decorrelation.runs:
                 means[frames] = factor.astype(flat.dtype) @ means[frames]
-                for rows, own in markers:
-                    differences[rows] = own.astype(flat.dtype) @ differences[rows]
+                for rows, marker_factor in markers:
+                    differences[rows] = marker_factor.astype(flat.dtype) @ differences[rows]
         differences += np.repeat(means, self.frame_size, axis=0)
         return differences.reshape(values.shape)
 

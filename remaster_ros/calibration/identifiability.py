@@ -95,12 +95,12 @@ def find_gauge(
     """
     scale, null, pivots, weak = _null_space(model, x, rows)
     _, by_x = prior_rows(model, priors, x, natural=True)
-    held = _unresolved(by_x @ null, pivots, model, scale)
+    fixed_pivots = _unresolved(by_x @ null, pivots, model, scale)
 
     directions, why = [], [''] * model.joints
     resolving = resolving_priors(priors, x, null, model)
     for column, pivot in enumerate(pivots):
-        if pivot in held:
+        if pivot in fixed_pivots:
             at = x[pivot] if pivot >= model.core else 0.0
             fixed_by = f'{model.names[pivot]} = {at:g}'
         else:
@@ -119,7 +119,7 @@ def find_gauge(
         if std > OPEN_ANGLE * model.chain.per_radian[worst] and not why[worst]:
             known = f'the data determine it only to {model.chain.shown_offset(worst, std)}'
             why[worst] = f'{known}: {directions[-1].why}'
-    return Gauge(tuple(directions), np.array(sorted(held), dtype=np.int64), tuple(why))
+    return Gauge(tuple(directions), np.array(sorted(fixed_pivots), dtype=np.int64), tuple(why))
 
 
 def known_offsets(
@@ -260,8 +260,8 @@ def _nearly_null(
     while np.any(active & angles):
         root = np.linalg.inv(np.linalg.qr(triangle[:, active], mode='r'))
         covariance = (root @ root.T) / np.outer(scale[active], scale[active])
-        own = np.sqrt(np.diag(covariance)) / per_radian[active]
-        std = np.where(angles[active], own, 0.0)
+        std_rad = np.sqrt(np.diag(covariance)) / per_radian[active]
+        std = np.where(angles[active], std_rad, 0.0)
         worst = int(np.argmax(std))
         typical = float(np.median(std[angles[active]]))
         if std[worst] < limit or std[worst] < min(factor * typical, OPEN_ANGLE):
@@ -324,9 +324,9 @@ def _reduce(
         pivots.append(pivot)
         work[:, [column, column + offset]] = work[:, [column + offset, column]]
         work[:, column] /= work[pivot, column]
-        others = work[pivot].copy()
-        others[column] = 0.0
-        work -= np.outer(work[:, column], others)
+        pivot_row = work[pivot].copy()
+        pivot_row[column] = 0.0
+        work -= np.outer(work[:, column], pivot_row)
     null = work / scale[:, None]
     null /= null[pivots, np.arange(len(pivots))]
     return null[:, np.argsort(pivots)], sorted(pivots)
@@ -343,13 +343,13 @@ def _unresolved(
     """
     limit = np.where(_angles(model), UNKNOWN_ANGLE * _per_radian(model), 1e3)
     limit[model.core :] = 1e6 / scale[model.core :]
-    held: set[int] = set()
+    fixed_pivots: set[int] = set()
     while True:
-        active = [column for column, pivot in enumerate(pivots) if pivot not in held]
+        active = [column for column, pivot in enumerate(pivots) if pivot not in fixed_pivots]
         std = _standard_deviations(by_direction[:, active])
         loose = {pivots[c]: s for c, s in zip(active, std, strict=True) if s > limit[pivots[c]]}
         if not loose:
-            return held
+            return fixed_pivots
         # All of the effects are held at once: their units cannot be compared.
         effects = {pivot for pivot in loose if pivot >= model.core}
         joints = {pivot: s for pivot, s in loose.items() if pivot < model.joints}
@@ -358,19 +358,21 @@ def _unresolved(
                 f'the observations do not determine {", ".join(model.names[p] for p in loose)}; '
                 'measure poses that are spread further and turn the tool'
             )
-        held |= effects or {max(joints, key=lambda j: joints[j] / model.chain.per_radian[j])}
+        fixed_pivots |= effects or {
+            max(joints, key=lambda j: joints[j] / model.chain.per_radian[j])
+        }
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:
     """Standard deviation by priors (m rows) of each of d directions, (d,); inf without any."""
     norm = np.linalg.norm(by_direction, axis=0)
-    held = norm > 0.0
-    unit = by_direction[:, held] / norm[held]
+    has_prior = norm > 0.0
+    unit = by_direction[:, has_prior] / norm[has_prior]
     values, vectors = np.linalg.eigh(unit.T @ unit)
     # Directions that only one and the same prior holds are nearly free of each other.
     variance = (vectors**2) @ (1.0 / np.maximum(values, 1e-14))
     std = np.full(len(norm), np.inf)
-    std[held] = np.sqrt(variance) / norm[held]
+    std[has_prior] = np.sqrt(variance) / norm[has_prior]
     return std
 
 

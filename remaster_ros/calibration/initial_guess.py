@@ -141,13 +141,14 @@ def with_bodies(
         count = int(selection.sum())
         if count < FEWEST_TURNS:
             continue
-        middle, away = _median_rotation(R_T_B[selection])
-        if away > LARGEST_TURN:
+        middle, deviation = _median_rotation(R_T_B[selection])
+        if deviation > LARGEST_TURN:
             name = model.sensor_names[sensor]
             why = (
                 f"the orientations are not fitted: half of those of '{name}' are more than "
-                f'{np.degrees(away):.0f} degrees from the robot model; check that the quaternions '
-                "are in the order x, y, z, w and give the body's axes in the sensor's frame"
+                f'{np.degrees(deviation):.0f} degrees from the robot model; check that the '
+                "quaternions are in the order x, y, z, w and give the body's axes in the sensor's "
+                'frame'
             )
             return model, z, why
         bodies.append((sensor, marker))

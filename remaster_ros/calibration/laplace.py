@@ -58,22 +58,22 @@ class Mode:
         The information of the orientations on the parameters is in the Gram matrix of the priors,
         at the noise of the mode.
         """
-        whole = self.linearisation.posterior
-        if not whole.rows.turning:
+        posterior = self.linearisation.posterior
+        if not posterior.rows.turning:
             return self
-        noise_model = whole.noise_model.of_points
-        groups, channels = len(noise_model.error_groups), len(whole.noise_model.channels)
+        noise_model = posterior.noise_model.of_points
+        groups, channels = len(noise_model.error_groups), len(posterior.noise_model.channels)
         shares = [
             part < len(noise_model.channels)
-            for parts in (whole.noise_model.separable, whole.noise_model.framed)
+            for parts in (posterior.noise_model.separable, posterior.noise_model.framed)
             for part in parts
         ]
         kept = np.arange(len(self.eta)) < len(noise_model.channels)
         kept[channels:] = shares
-        weights = 1.0 / whole.variances(self.eta)[groups:]
+        weights = 1.0 / posterior.variances(self.eta)[groups:]
         linearisation = replace(
             self.linearisation,
-            posterior=replace(whole, noise_model=noise_model),
+            posterior=replace(posterior, noise_model=noise_model),
             grams=self.linearisation.grams[:groups],
             prior=self.linearisation.prior
             + np.tensordot(weights, self.linearisation.grams[groups:], axes=1),
@@ -210,10 +210,10 @@ def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> Fl
     """
     posterior, z = linearisation.posterior, linearisation.z
     model, free, f = posterior.model, posterior.free, len(step)
-    near = posterior.parameters(z[free] + BENT * np.stack((-step, 0.0 * step, step)))
+    neighbours = posterior.parameters(z[free] + BENT * np.stack((-step, 0.0 * step, step)))
 
     def joined(rows: Rows, _: slice) -> FloatArray:
-        before, here, after = (model.predict(point, rows) for point in near)
+        before, here, after = (model.predict(point, rows) for point in neighbours)
         second = (before - 2.0 * here + after) / BENT**2
         return np.concatenate((model.jacobian(z, rows)[:, :, free], second[:, :, None]), axis=2)
 

@@ -180,13 +180,13 @@ def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, F
         u = without @ e
         step = np.append(spread[rows].T @ u, 1.0)
         for kind in np.unique(of_kind[rows]).tolist():
-            own = of_kind[rows] == kind
-            uncertain = without[np.ix_(own, own)]
-            square = step @ grams[kind] @ step - u[own] @ u[own]
+            kind_rows = of_kind[rows] == kind
+            uncertain = without[np.ix_(kind_rows, kind_rows)]
+            square = step @ grams[kind] @ step - u[kind_rows] @ u[kind_rows]
             spent = free[kind] + np.sum(without * (by_kind[kind][rows] @ X.T))
-            spent -= np.trace(uncertain) - own.sum()
-            freedom = np.sum(of_kind == kind) - own.sum() - spent
-            distance = u[own] @ np.linalg.solve(uncertain, u[own]) / own.sum()
+            spent -= np.trace(uncertain) - kind_rows.sum()
+            freedom = np.sum(of_kind == kind) - kind_rows.sum() - spent
+            distance = u[kind_rows] @ np.linalg.solve(uncertain, u[kind_rows]) / kind_rows.sum()
             distances[kind].append(distance * max(freedom, 1.0) / square)
     return {kind: np.array(found) for kind, found in distances.items()}
 
@@ -217,12 +217,12 @@ def held_out_tests(
         return ()
     held_out = posterior.model.rows_of_path(measurements, np.flatnonzero(kept)).of_points
     fitted = _contrasts(mode, measurements, spread_poses(posterior.rows))
-    others = _contrasts(mode, measurements, spread_poses(held_out))
+    held_out_contrasts = _contrasts(mode, measurements, spread_poses(held_out))
     return tuple(
         StructureTest(
             'held_out', kind % 2 == 1, p_value, posterior.model.sensor_names[kind // 2], ratio
         )
-        for kind, p_value, ratio in compared(fitted, others, mode.covariance)
+        for kind, p_value, ratio in compared(fitted, held_out_contrasts, mode.covariance)
     )
 
 

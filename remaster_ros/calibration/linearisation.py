@@ -115,10 +115,10 @@ class Linearisation:
         trace = np.array([np.vdot(gram[:f, :f], inverse) for gram in self.grams])
         pulls = (self.grams @ error) / self.posterior.variances(eta)[:, None]
         square = pulls @ error
-        left = solve_triangular(root, pulls[:, :f].T, lower=True)
+        white_pulls = solve_triangular(root, pulls[:, :f].T, lower=True)
         slope = 0.5 * (square + trace / self.posterior.variances(eta))
         slope -= 0.5 * self.posterior.noise_model.freedom
-        return float(log_marginal), slope, 0.5 * (np.diag(square) - left.T @ left)
+        return float(log_marginal), slope, 0.5 * (np.diag(square) - white_pulls.T @ white_pulls)
 
 
 def log_determinant(factor: FloatArray) -> FloatArray:

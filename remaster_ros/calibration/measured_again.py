@@ -33,8 +33,8 @@ class MeasuredAgain:
         q, held_out = measurements.q[first], measurements.is_validation[first]
         if not held_out.any() or held_out.all():
             return cls(0, int(held_out.sum()))
-        away = scipy.spatial.cKDTree(q[~held_out]).query(q[held_out], p=np.inf)[0]
-        return cls(int(np.sum(away < SAME_RAD)), int(held_out.sum()))
+        distances = scipy.spatial.cKDTree(q[~held_out]).query(q[held_out], p=np.inf)[0]
+        return cls(int(np.sum(distances < SAME_RAD)), int(held_out.sum()))
 
     @property
     def most(self) -> bool:

@@ -277,12 +277,15 @@ def _costs(
     spread = robust_spread(rows.target - start.predict(z, rows), rows)
     costs = []
     for table in (before, after):
-        whole = problem(table)
-        if (whole.sensor_names, whole.marker_names) != (fitted.sensor_names, fitted.marker_names):
+        table_problem = problem(table)
+        if (table_problem.sensor_names, table_problem.marker_names) != (
+            fitted.sensor_names,
+            fitted.marker_names,
+        ):
             return None
-        rows = Rows.of(whole.measurements, whole.fitted, start.reference)
+        rows = Rows.of(table_problem.measurements, table_problem.fitted, start.reference)
         squares = np.sum((rows.target - start.predict(z, rows)) ** 2, axis=1)
-        width = CAUCHY_WIDTH * spread[whole.measurements.sensor[rows.source]]
+        width = CAUCHY_WIDTH * spread[table_problem.measurements.sensor[rows.source]]
         cost = np.empty(len(rows))
         cost[rows.source] = np.log1p(squares / width**2)
         costs.append(cost)
@@ -330,14 +333,18 @@ def sentence_of_mistakes(
                 f'with {words} the marker is {shown_mm(found.marker_shift_m)} from where it was '
                 f'said to be; without, {shown_mm(given.marker_shift_m)}'
             )
-    told = {words: options}
+    options_by_words = {words: options}
     for fit in mistakes.fitting[1:]:
         if fit.arrangement.changes <= found.arrangement.changes + 1:
             other, instead = in_words(fit.arrangement, session, columns)
-            told.setdefault(other, instead)
-    others = [f'with {other} ({instead})' for other, instead in list(told.items())[1:]]
-    if others:
-        sentence += f'; {" or ".join(others)} they fit as well, and the data cannot tell which'
+            options_by_words.setdefault(other, instead)
+    alternatives = [
+        f'with {other} ({instead})' for other, instead in list(options_by_words.items())[1:]
+    ]
+    if alternatives:
+        sentence += (
+            f'; {" or ".join(alternatives)} they fit as well, and the data cannot tell which'
+        )
     return sentence, options
 
 

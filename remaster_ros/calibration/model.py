@@ -459,8 +459,8 @@ class Model:
         if rows.turned is not None:
             # d log(exp(w) exp(v)) = J_l(v)⁻¹ w for a small turn w.
             end = rows.points
-            away = self._turns(x, offsets, rows, correction)
-            derivative[end:] = _inverse_left_jacobian(away) @ derivative[end:]
+            turns = self._turns(x, offsets, rows, correction)
+            derivative[end:] = _inverse_left_jacobian(turns) @ derivative[end:]
         return derivative
 
     def _by_bodies(
@@ -531,9 +531,12 @@ def _rotation_vector(rotation: FloatArray) -> FloatArray:
     axis = 0.5 * np.stack((skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]), axis=-1)
     sine = np.linalg.norm(axis, axis=-1)
     cosine = 0.5 * (np.trace(rotation, axis1=-2, axis2=-1) - 1.0)
-    near = sine > 1e-9
+    has_axis = sine > 1e-9
     vector: FloatArray = (
-        axis * np.where(near, np.arctan2(sine, cosine) / np.where(near, sine, 1.0), 1.0)[..., None]
+        axis
+        * np.where(has_axis, np.arctan2(sine, cosine) / np.where(has_axis, sine, 1.0), 1.0)[
+            ..., None
+        ]
     )
     opposite = (cosine < 0.0) & (sine < 1e-3)
     if np.any(opposite):
@@ -545,9 +548,9 @@ def _inverse_left_jacobian(vectors: FloatArray) -> FloatArray:
     """Inverses (n, 3, 3) of the left Jacobians of rotation vectors (n, 3), rad."""
     angle = np.linalg.norm(vectors, axis=-1)
     K = _cross_matrix(vectors)
-    near = angle < 1e-4
-    half = 0.5 * np.where(near, 1.0, angle)
+    small_angle = angle < 1e-4
+    half = 0.5 * np.where(small_angle, 1.0, angle)
     # (1 - x cot x) / (2 x)² with x half the angle; its series begins with 1/12.
-    weight = np.where(near, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
+    weight = np.where(small_angle, 1.0 / 12.0, (1.0 - half / np.tan(half)) / (4.0 * half**2))
     inverted: FloatArray = np.eye(3) - 0.5 * K + weight[:, None, None] * (K @ K)
     return inverted

@@ -66,8 +66,10 @@ def orientation_information(mode: Mode) -> OrientationInformation | None:
     joints = np.flatnonzero(posterior.free < posterior.model.joints)
     where = posterior.free[joints]
     # How bodies stand is a matter of orientations.
-    own = ~np.isin(posterior.free, np.arange(posterior.model.markers_end, posterior.model.core))
-    used = np.flatnonzero(own | (np.diag(gram)[:f] > 0.0))
+    point_parameters = ~np.isin(
+        posterior.free, np.arange(posterior.model.markers_end, posterior.model.core)
+    )
+    used = np.flatnonzero(point_parameters | (np.diag(gram)[:f] > 0.0))
     scale = np.sqrt(np.diag(gram)[used])
     scaled = gram[np.ix_(used, used)] / np.outer(scale, scale)
     if not np.all(scale > 0.0) or np.linalg.eigvalsh(scaled)[0] < ROUNDING:
@@ -76,13 +78,13 @@ def orientation_information(mode: Mode) -> OrientationInformation | None:
     covariance = np.zeros((f, f))
     covariance[np.ix_(used, used)] = np.linalg.inv(scaled) / np.outer(scale, scale)
     std[where] = np.sqrt(np.diag(covariance)[joints])
-    whole = mode.linearisation.gram(mode.eta)[:f, f]
-    away = covariance @ gram[:f, f] - mode.covariance @ whole
-    shift[where] = -away[joints]
-    left = covariance[np.ix_(joints, joints)]
-    root = np.linalg.cholesky(left)
+    full_pull = mode.linearisation.gram(mode.eta)[:f, f]
+    difference = covariance @ gram[:f, f] - mode.covariance @ full_pull
+    shift[where] = -difference[joints]
+    joint_covariance = covariance[np.ix_(joints, joints)]
+    root = np.linalg.cholesky(joint_covariance)
     inner = np.linalg.inv(root)
-    added = inner @ (left - mode.covariance[np.ix_(joints, joints)]) @ inner.T
+    added = inner @ (joint_covariance - mode.covariance[np.ix_(joints, joints)]) @ inner.T
     values, vectors = np.linalg.eigh(added)
     kept = values > LEAST_ADDED
     square = np.sum((vectors.T @ (inner @ shift[where]))[kept] ** 2 / values[kept])

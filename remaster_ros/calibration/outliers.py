@@ -106,10 +106,10 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
     sigma, pose_sigma = robust_noise(rows, errors, good)
 
     # Error common to the rows of the pose, by the other good rows.
-    others = count[group] - good
-    mean = (total[group] - errors * good[:, None]) / np.maximum(others, 1.0)[:, None]
+    other_count = count[group] - good
+    mean = (total[group] - errors * good[:, None]) / np.maximum(other_count, 1.0)[:, None]
     variance, common = sigma[sensor] ** 2, pose_sigma[sensor] ** 2
-    share = others * common / (variance + others * common)
+    share = other_count * common / (variance + other_count * common)
     spread = np.sqrt(variance + common * (1.0 - share))
     deviation = np.linalg.norm(errors - share[:, None] * mean, axis=1)
     sigmas = deviation / spread
@@ -215,8 +215,8 @@ def robust_noise(rows: Rows, errors: FloatArray, good: BoolArray) -> tuple[Float
             sigma[index] = pose_total
             continue
         sigma[index] = robust_scale(deviation[span][paired])
-        own = sigma[index] ** 2 * np.mean(1.0 / count[poses])
-        pose_sigma[index] = np.sqrt(max(pose_total**2 - own, 0.0))
+        variance_of_mean = sigma[index] ** 2 * np.mean(1.0 / count[poses])
+        pose_sigma[index] = np.sqrt(max(pose_total**2 - variance_of_mean, 0.0))
     return sigma, pose_sigma
 
 

@@ -210,12 +210,12 @@ def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
 
     A direction of a held joint is fixed by nothing, any other by markers taken as exact.
     """
-    held = {f'{model.names[index]} = 0' for index in gauge.held}
+    held_joints = {f'{model.names[index]} = 0' for index in gauge.held}
     directions, why = [], list(gauge.why)
     for direction in gauge.directions:
         old = direction.fixed_by
         new = f'taking the marker as known exactly, where there is no more than {old}'
-        if old in held:
+        if old in held_joints:
             new = (
                 'nothing: its prior is flat and the chain wanders along it (registrations and '
                 f'markers are given for {old})'

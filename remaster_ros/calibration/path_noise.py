@@ -119,14 +119,14 @@ class Decorrelation:
             means = _inverse_factor(noise.of_frames(sensor, at))
             stop = int(frame_start[last - 1] + frame_size[last - 1])
             rows = np.arange(int(frame_start[first]), stop)
-            own = []
+            marker_factors = []
             if noise.marker_share[sensor] > RANGE_SHARE[0]:
-                for one in np.unique(marker[rows]):
-                    selection = rows[marker[rows] == one]
-                    own.append(
+                for index in np.unique(marker[rows]):
+                    selection = rows[marker[rows] == index]
+                    marker_factors.append(
                         (selection, _inverse_factor(noise.of_markers(sensor, source[selection])))
                     )
-            runs.append((slice(first, last), means, tuple(own)))
+            runs.append((slice(first, last), means, tuple(marker_factors)))
         return cls(tuple(runs))
 
 
@@ -177,11 +177,11 @@ def path_noise(
     first = np.flatnonzero(np.diff(frame, prepend=-1))
     weight = np.sqrt(size)[:, None]
     mean = np.add.reduceat(errors, first, axis=0) / size[:, None]
-    left = np.concatenate((columns, errors[..., None]), axis=2)
-    joined = np.add.reduceat(left, first, axis=0) / weight[..., None]
+    augmented_columns = np.concatenate((columns, errors[..., None]), axis=2)
+    joined = np.add.reduceat(augmented_columns, first, axis=0) / weight[..., None]
     # Long recordings: the lengths of a part of them are those of all.
-    some = slice(0, MOST_SEARCHED)
-    joined, at = joined[some], source[first][some]
+    part = slice(0, MOST_SEARCHED)
+    joined, at = joined[part], source[first][part]
     position, turn = before.position[at], before.turn[at]
     f, p = len(joined), prior.shape[0]
     flat = joined.reshape(f, -1)
@@ -198,20 +198,20 @@ def path_noise(
         unit = 1.0 / np.sqrt(np.maximum(np.diag(inner), np.finfo(float).tiny))
         root = cho_factor(inner * np.outer(unit, unit) + 1e-10 * np.eye(p), lower=True)
         pull = solve_triangular(root[0], unit * gram[:p, p], lower=True)
-        rest = max(float(gram[p, p] - pull @ pull), 1e-300)
+        residual_square = max(float(gram[p, p] - pull @ pull), 1e-300)
         logdet = 3.0 * np.sum(np.log(np.diag(factor)))
         logdet += np.sum(np.log(np.diag(root[0])) - np.log(unit))
         # A weak prior on the lengths: a path may not show them.
         weak = 0.5 * (logs[1] ** 2 + logs[2] ** 2) / LOG_LENGTH_STD**2
-        return float(logdet + 0.5 * (3 * f - p) * np.log(rest) + weak)
+        return float(logdet + 0.5 * (3 * f - p) * np.log(residual_square) + weak)
 
     start = np.array([4.0, 0.0, 0.0])
     tries = [
         (*_minimised(partial(cost, order=order), start), order) for order in range(len(ORDERS))
     ]
-    _, best, order = min(tries, key=lambda one: one[0])
+    _, best, order = min(tries, key=lambda result: result[0])
     share, length_m, length_rad = _natural(best)
-    own, scale = _of_markers(
+    marker_share, scale = _of_markers(
         errors - mean[frame],
         frame,
         marker,
@@ -221,7 +221,7 @@ def path_noise(
     )
     values = {
         'share': share,
-        'marker_share': own,
+        'marker_share': marker_share,
         'length_m': length_m,
         'length_rad': length_rad,
         'marker_scale': scale,
@@ -272,8 +272,8 @@ def _of_markers(
     index into `ORDERS`.
     """
     series: dict[bytes, tuple[IntArray, list[FloatArray]]] = {}
-    for one in np.unique(marker):
-        of_marker = (marker == one) & (frame < frames)
+    for candidate in np.unique(marker):
+        of_marker = (marker == candidate) & (frame < frames)
         if of_marker.sum() > frames // 2:
             at = frame[of_marker]
             series.setdefault(at.tobytes(), (at, []))[1].append(deviations[of_marker])
@@ -283,10 +283,10 @@ def _of_markers(
     def cost(logs: FloatArray) -> float:
         share, scale = _natural_of_markers(logs)
         squares = logdet = count = 0.0
-        whole = _correlations(distance / scale, share, order)
+        correlations = _correlations(distance / scale, share, order)
         for at, several in series.values():
             values = np.concatenate(several, axis=1)
-            factor = np.linalg.cholesky(whole[np.ix_(at, at)])
+            factor = np.linalg.cholesky(correlations[np.ix_(at, at)])
             white = solve_triangular(factor, values, lower=True, check_finite=False)
             squares += float(np.sum(white**2))
             logdet += values.shape[1] * float(np.sum(np.log(np.diag(factor))))
@@ -296,7 +296,7 @@ def _of_markers(
 
     # A process at the edge of what is seen is begun from either side.
     tries = [_minimised(cost, np.array([logit, 0.0])) for logit in (-4.0, 1.0)]
-    return _natural_of_markers(min(tries, key=lambda one: one[0])[1])
+    return _natural_of_markers(min(tries, key=lambda candidate: candidate[0])[1])
 
 
 def _natural_of_markers(logs: FloatArray) -> tuple[float, float]:

@@ -220,15 +220,19 @@ def _block(
     distances: list[FloatArray] = []
     for *points, drawn in (in_sensor, in_base):
         noisy = drawn + noise
-        distances += [_distances_between(place, one) for one in points for place in (noisy, drawn)]
+        distances += [
+            _distances_between(place, prediction)
+            for prediction in points
+            for place in (noisy, drawn)
+        ]
     return np.reshape(distances, (2, 4, -1))
 
 
-def _distances_between(places: FloatArray, others: FloatArray) -> FloatArray:
+def _distances_between(places: FloatArray, other_places: FloatArray) -> FloatArray:
     """Distances between points (..., 3) and others, which broadcast, m, flattened.
 
     Three times as fast as `numpy.linalg.norm`.
     """
-    shift = places - others
+    shift = places - other_places
     distances: FloatArray = np.sqrt(np.einsum('...i,...i->...', shift, shift))
     return distances.ravel()

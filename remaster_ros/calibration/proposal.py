@@ -134,9 +134,9 @@ class AdaptedProposal:
             inner, log_volume, marginal = self._inner(block)
             white = inner[:, : self.dimension - len(self.mode.eta)]
             parts.append(marginal + log_volume - 0.5 * np.sum(white**2, axis=1))
-        near = np.all(np.abs(eta - self.mode.eta) <= FARTHEST, axis=1)
+        within_range = np.all(np.abs(eta - self.mode.eta) <= FARTHEST, axis=1)
         inside = self.mode.linearisation.posterior.inside(points)
-        return np.where(near & inside, np.concatenate(parts), -np.inf)
+        return np.where(within_range & inside, np.concatenate(parts), -np.inf)
 
     def dispersed(self, count: int, rng: np.random.Generator) -> FloatArray:
         """First states of chains, (count, d), dispersed twice as far as the draws."""
@@ -181,8 +181,8 @@ class AdaptedProposal:
     def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """`Linearisation.conditional` of noise (n, e), clipped `FARTHEST` from the mode."""
         # Outside, rounding removes the information. A proposal may use any function of the noise.
-        near = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
-        return self.mode.linearisation.conditional(near)
+        clipped_eta = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
+        return self.mode.linearisation.conditional(clipped_eta)
 
     @property
     def _block(self) -> int:

@@ -111,10 +111,12 @@ def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
         scaled, scale = system(logs)
         root = cho_factor(scaled, lower=True)
         right = pull / scale / np.exp(logs[0])
-        left = square / np.exp(logs[0]) - right @ cho_solve(root, right)
+        residual_square = square / np.exp(logs[0]) - right @ cho_solve(root, right)
         determinant = np.sum(np.log(np.diag(root[0]))) + np.sum(np.log(scale))
         weak = np.sum(((logs[1:] - START) / PRIOR_STD) ** 2)
-        return float(0.5 * (count * logs[0] + size @ logs[1:] + left + weak) + determinant)
+        return float(
+            0.5 * (count * logs[0] + size @ logs[1:] + residual_square + weak) + determinant
+        )
 
     start = np.append(0.0, np.full(len(size), START))
     bounds = [NOISE_RANGE, *[RANGE] * len(size)]
@@ -171,13 +173,13 @@ class Orientations:
         if self.why_not or self.information is None:
             return self.why_not
         noises = ' and '.join(
-            f'{np.degrees(np.sqrt(one.sigma_m**2 + (one.pose_sigma_m or 0.0) ** 2)):.3f} deg '
+            f'{np.degrees(np.sqrt(noise.sigma_m**2 + (noise.pose_sigma_m or 0.0) ** 2)):.3f} deg '
             f'({sensor})'
-            for sensor, one in self.noise.items()
+            for sensor, noise in self.noise.items()
         )
         text = f'{self.count} orientations are fitted, too; their noise is {noises} per axis'
-        held = std <= 0.0
-        gain = np.where(held, 0.0, self.information.std_without / np.where(held, 1.0, std))
+        is_fixed = std <= 0.0
+        gain = np.where(is_fixed, 0.0, self.information.std_without / np.where(is_fixed, 1.0, std))
         joint = int(np.argmax(gain))
         if not np.isfinite(gain[joint]):
             return f'{text}; the positions alone do not determine {chain.joint_names[joint]}'
@@ -488,10 +490,10 @@ def build_result(
     flat = z.reshape(-1, model.size)
     x_after = model.natural(sampled.z_mean)
     predicted_after = predicted_rows(problem, model, sampled.z_mean)
-    held = np.where(unfixed, model.chain.per_radian, 0.0)
-    mean, std, interval = _offset_summary(flat[:, : model.joints], held, sampled.taken_as_known)
+    radian = np.where(unfixed, model.chain.per_radian, 0.0)
+    mean, std, interval = _offset_summary(flat[:, : model.joints], radian, sampled.taken_as_known)
     std_by_data = _offset_summary(
-        by_data.z[..., : model.joints].reshape(-1, model.joints), held, sampled.taken_as_known
+        by_data.z[..., : model.joints].reshape(-1, model.joints), radian, sampled.taken_as_known
     )[1]
     T_R_N, markers = model.T_R_N(x_after), model.markers(x_after)
     x_draws = model.natural(flat)
@@ -634,14 +636,14 @@ def _orientations(
 
 
 def _offset_summary(
-    draws: FloatArray, held: FloatArray, taken_as_known: FloatArray
+    draws: FloatArray, radian: FloatArray, taken_as_known: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad or m.
 
-    ``held``: 0 for identifiable joints, otherwise the offset that counts as a radian, (k,); these
-    joints have mean 0 and the std and interval of a whole turn.
+    ``radian``: 0 for identifiable joints, otherwise the offset that counts as a radian, (k,);
+    these joints have mean 0 and the std and interval of a whole turn.
     """
-    undetermined = held > 0.0
+    undetermined = radian > 0.0
     mean = draws.mean(axis=0)
     std = np.hypot(draws.std(axis=0, ddof=1), taken_as_known)
     interval = np.quantile(draws, (0.025, 0.975), axis=0).T
@@ -650,6 +652,6 @@ def _offset_summary(
     interval = mean[:, None] + half * (-1.0, 1.0)
     return (
         np.where(undetermined, 0.0, mean),
-        np.where(undetermined, UNKNOWN_STD * held, std),
-        np.where(undetermined[:, None], np.outer(held, (-np.pi, np.pi)), interval),
+        np.where(undetermined, UNKNOWN_STD * radian, std),
+        np.where(undetermined[:, None], np.outer(radian, (-np.pi, np.pi)), interval),
     )

@@ -437,18 +437,18 @@ class ArmModel:
         )
         found = []
         for name in self.parameter_names:
-            kind, _, rest = name.partition('.')
+            kind, _, suffix = name.partition('.')
             if kind in units:
                 found.append(units[kind])
             elif kind == 'joint_offset':
-                found.append(chain.units[chain.joint_names.index(rest)])
+                found.append(chain.units[chain.joint_names.index(suffix)])
             elif kind == 'joint_term':
-                term = self.joint_terms[int(rest.split('.')[0])]
+                term = self.joint_terms[int(suffix.split('.')[0])]
                 found.append(unit_of(term.function, chain, chain.units[term.joint]))
             elif kind == 'base_term':
-                found.append(unit_of(self.base_terms[int(rest.split('.')[0])].function, chain))
+                found.append(unit_of(self.base_terms[int(suffix.split('.')[0])].function, chain))
             else:
-                unit = 'rad' if rest.rpartition('.')[2] in _TURNS else 'm'
+                unit = 'rad' if suffix.rpartition('.')[2] in _TURNS else 'm'
                 found.append(f'{unit}/K' if kind == 'growth' else unit)
         return tuple(found)
 
@@ -462,8 +462,8 @@ class ArmModel:
             *(term.coefficients for term in self.joint_terms),
             *(term.coefficients for term in self.base_terms),
             *(
-                np.concatenate((one.shifts, one.turns), axis=1).ravel()
-                for one in (self.geometry, self.growth)
+                np.concatenate((geometry.shifts, geometry.turns), axis=1).ravel()
+                for geometry in (self.geometry, self.growth)
             ),
             self.lateral_compliance,
         ]
@@ -487,8 +487,8 @@ class ArmModel:
 
         def terms(given: tuple[Term, ...]) -> tuple[Term, ...]:
             return tuple(
-                replace(one, coefficients=one.coefficients + take(len(one.coefficients)))
-                for one in given
+                replace(term, coefficients=term.coefficients + take(len(term.coefficients)))
+                for term in given
             )
 
         # In the order of `parameter_names`.

@@ -77,7 +77,7 @@ def nearest(
         )
         step = target - x[rows]
         going = np.abs(step).max(axis=1) > CONVERGED_RAD
-        rows, step, error, jacobian = (one[going] for one in (rows, step, error, jacobian))
+        rows, step, error, jacobian = (values[going] for values in (rows, step, error, jacobian))
         tried = np.arange(len(rows))
         for halving in range(HALVINGS):
             if not len(tried):
@@ -91,7 +91,9 @@ def nearest(
             error[good], jacobian[good] = new_error[gains], new_jacobian[gains]
             tried = tried[~gains]
         # A row none of whose steps gains has arrived, to rounding.
-        rows, error, jacobian = (np.delete(one, tried, axis=0) for one in (rows, error, jacobian))
+        rows, error, jacobian = (
+            np.delete(values, tried, axis=0) for values in (rows, error, jacobian)
+        )
         if not len(rows):
             break
     return x
@@ -120,12 +122,12 @@ def box_minimum(
         if not len(rows):
             break
         H, x_active, is_free = hessian[rows], x[rows], free[rows]
-        rest = np.where(is_free, 0.0, x_active)
-        right = linear[rows] - np.einsum('nij,nj->ni', H, rest)
+        x_fixed = np.where(is_free, 0.0, x_active)
+        right = linear[rows] - np.einsum('nij,nj->ni', H, x_fixed)
         both = is_free[:, :, None] & is_free[:, None, :]
-        best = np.linalg.solve(np.where(both, H, eye), np.where(is_free, right, rest)[..., None])[
-            ..., 0
-        ]
+        best = np.linalg.solve(
+            np.where(both, H, eye), np.where(is_free, right, x_fixed)[..., None]
+        )[..., 0]
         step = best - x_active
         # How much of the step each joint can go.
         end = np.where(step > 0.0, high[rows], low[rows])

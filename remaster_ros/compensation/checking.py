@@ -87,7 +87,9 @@ class Measured:
                 rows[i] for i in np.flatnonzero(is_same_pose(chain, self.q[rows], self.q[row]))
             ]
             seen_by = self.sensor[row], self.marker[row]
-            if seen_by not in [(self.sensor[one], self.marker[one]) for one in same]:
+            if seen_by not in [
+                (self.sensor[same_row], self.marker[same_row]) for same_row in same
+            ]:
                 rows.append(row)
         sensor = tuple(self.sensor[row] for row in rows)
         marker = tuple(self.marker[row] for row in rows)
@@ -110,7 +112,7 @@ class Measured:
                 if (self.sensor[row], self.marker[row]) == (sensor, marker)
             ]
             if not same:
-                at = ', '.join(chain.shown_offset(j, one) for j, one in enumerate(first.q[i]))
+                at = ', '.join(chain.shown_offset(j, value) for j, value in enumerate(first.q[i]))
                 raise InputError(
                     f'no reading of {marker} by {sensor} at the joints {at}, where the first '
                     'check has one: measure the same poses, or begin another history'
@@ -159,12 +161,12 @@ def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
     sensors, markers = list(dict.fromkeys(measured.sensor)), list(dict.fromkeys(measured.marker))
     frames, T_R_N = [], {}
     for marker in markers:
-        selection = np.array([one == marker for one in measured.marker])
+        selection = np.array([name == marker for name in measured.marker])
         points[selection] = apply(state.tool[selection], model.markers[marker])
     for sensor in sensors:
-        selection = np.array([one == sensor for one in measured.sensor])
+        selection = np.array([name == sensor for name in measured.sensor])
         for marker in markers:
-            both = selection & [one == marker for one in measured.marker]
+            both = selection & [name == marker for name in measured.marker]
             derivative[both] = model.derivative(state, sensor, marker)[both]
         T_R_N[sensor], _ = register_points(points[selection], measured.position[selection])
         errors[selection] = apply(T_R_N[sensor], measured.position[selection]) - points[selection]
@@ -406,7 +408,7 @@ def judge(
     smallest_m
         Smallest change at the tool that matters, m.
     """
-    residuals_of_checks = [seen(model, one) for one in checks]
+    residuals_of_checks = [seen(model, entry) for entry in checks]
     last, T = residuals_of_checks[-1], len(residuals_of_checks)
     levers = last.lever_m
     information = np.sum(last.joints**2, axis=0)
@@ -414,7 +416,7 @@ def judge(
     x_m = _series(residuals_of_checks)
     counts = np.concatenate((is_seen, np.ones(last.tool.shape[1], bool)))
     found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
-    total = float(np.mean([one.evidence for one, counted in zip(found, counts) if counted]))
+    total = float(np.mean([entry.evidence for entry, counted in zip(found, counts) if counted]))
     best = max(np.flatnonzero(counts), key=lambda i: found[i].evidence)
     at = found[best].at
     noise = _noise(residuals_of_checks, at if total > DOUBT else 0)
@@ -425,12 +427,14 @@ def judge(
     clear = abs(found[best].size) - found[best].half > smallest_m
     days, in_days = _days(checks)
     lines = [drift(x_m[:, i], days) for i in range(x_m.shape[1])]
-    of_lines = float(np.mean([one.evidence for one, counted in zip(lines, counts) if counted]))
+    of_lines = float(np.mean([entry.evidence for entry, counted in zip(lines, counts) if counted]))
     line = lines[max(np.flatnonzero(counts), key=lambda i: lines[i].evidence)]
     drifts = of_lines >= TREND_EVIDENCE and of_lines > total and abs(line.size) > line.half
     if drifts:
         weights, at = line.weights, min(line.at + 1, T - 1)
-        noise = _scatter(np.array([one.residuals for one in residuals_of_checks]), days, line.at)
+        noise = _scatter(
+            np.array([entry.residuals for entry in residuals_of_checks]), days, line.at
+        )
         noise /= np.sqrt(last.freedom)
         std = noise / np.sqrt(np.where(is_seen, information, np.inf))
         smallest = detectable_m(last.joints, levers, noise)
@@ -481,9 +485,9 @@ def judge(
     if named or tool:
         # What has changed is taken out of the others, which would show a part of it.
         taken = last.joints[:, list(named[:1])] if named else last.tool
-        others = _series([_projected(one, taken) for one in residuals_of_checks])
+        other_series = _series([_projected(entry, taken) for entry in residuals_of_checks])
         kept = np.isin(np.arange(x_m.shape[1]), named[:1])
-        x_m = np.where(kept, x_m, others)
+        x_m = np.where(kept, x_m, other_series)
         found = [change(x_m[:, i]) for i in range(x_m.shape[1])]
     # Where nothing is named, the newest check against all before it: no place is chosen.
     place = at if named or tool else T - 1
@@ -525,7 +529,7 @@ def _days(checks: Sequence[Measured]) -> tuple[FloatArray, bool]:
 
     If a time is missing, or is not later than the one before, the checks are numbered instead.
     """
-    when = np.array([one.when_s for one in checks])
+    when = np.array([check.when_s for check in checks])
     if np.isfinite(when).all() and np.all(np.diff(when) > 0.0):
         return (when - when[0]) / 86_400.0, True
     return np.arange(float(len(checks))), False
@@ -557,7 +561,7 @@ def _length(weights: FloatArray) -> float:
     return float(np.linalg.norm(weights))
 
 
-def _projected(one: CheckResiduals, taken: FloatArray) -> CheckResiduals:
+def _projected(check: CheckResiduals, taken: FloatArray) -> CheckResiduals:
     """Copy of a check's residuals and effects, projected orthogonally to columns (3 n, c)."""
     basis = np.linalg.qr(taken)[0]
 
@@ -565,10 +569,10 @@ def _projected(one: CheckResiduals, taken: FloatArray) -> CheckResiduals:
         return np.asarray(columns - basis @ (basis.T @ columns))
 
     return replace(
-        one,
-        residuals=projected(one.residuals),
-        joints=projected(one.joints),
-        tool=projected(one.tool),
+        check,
+        residuals=projected(check.residuals),
+        joints=projected(check.joints),
+        tool=projected(check.tool),
     )
 
 
@@ -576,10 +580,10 @@ def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
     """Change at the tool of each joint alone, and of each marker, m, (T, k + 3 m)."""
     rows = [
         (
-            *(_single_column_sizes(one.joints, one.residuals) * one.lever_m),
-            *np.linalg.lstsq(one.tool, one.residuals)[0],
+            *(_single_column_sizes(check.joints, check.residuals) * check.lever_m),
+            *np.linalg.lstsq(check.tool, check.residuals)[0],
         )
-        for one in residuals_of_checks
+        for check in residuals_of_checks
     ]
     return np.array(rows)
 
@@ -601,7 +605,7 @@ def _noise(residuals_of_checks: Sequence[CheckResiduals], at: int) -> float:
     error.
     """
     rests, freedom = (
-        np.array([one.residuals for one in residuals_of_checks]),
+        np.array([check.residuals for check in residuals_of_checks]),
         residuals_of_checks[-1].freedom,
     )
     parts = [part for part in (rests[:at], rests[at:]) if len(part)]
@@ -627,7 +631,7 @@ def _moved(
     """
     shift = np.zeros_like(measured.position)
     for sensor, T in last.T_R_N.items():
-        selection = np.array([one == sensor for one in measured.sensor])
+        selection = np.array([name == sensor for name in measured.sensor])
         place = measured.position[selection]
         shift[selection] = apply(T, place) - apply(before.get(sensor, T), place)
     squares, size = float(np.sum(shift**2)), float(np.sqrt(np.mean(np.sum(shift**2, axis=1))))
@@ -655,9 +659,9 @@ def _is_doubtful(
     (k,).
     """
     found = [change(x_m[:, i]) for i in np.flatnonzero(counts)]
-    best = max(found, key=lambda one: one.evidence)
+    best = max(found, key=lambda estimate: estimate.evidence)
     small = abs(best.size) + best.half < smallest_m
-    doubted = float(np.mean([one.evidence for one in found])) > DOUBT and not small
+    doubted = float(np.mean([estimate.evidence for estimate in found])) > DOUBT and not small
     return doubted or _is_outlying(residuals_of_checks, x_m, counts, is_seen)
 
 
@@ -685,7 +689,7 @@ def _is_outlying(
         return bool(np.any(deviation[counts] > BEYOND_STD * std[counts]))
     # Too few for a scatter: what one joint, or a marker, leaves of the difference is the noise.
     step = last.residuals - (
-        np.mean([one.residuals for one in residuals_of_checks[:-1]], axis=0) if T > 1 else 0.0
+        np.mean([check.residuals for check in residuals_of_checks[:-1]], axis=0) if T > 1 else 0.0
     )
     joints = last.joints[:, is_seen]
     squares = np.sum(joints**2, axis=0)
@@ -713,7 +717,7 @@ def _changed_joints(
     All explanations within odds of 20 of the best (`NAMING_ODDS`). ``weights``: (T,); the change
     of the readings is the sum of weights times checks.
     """
-    step = weights @ np.array([one.residuals for one in residuals_of_checks])
+    step = weights @ np.array([entry.residuals for entry in residuals_of_checks])
     variance = noise**2 * float(weights @ weights)
     last = residuals_of_checks[-1]
     squares = np.where(is_seen, np.sum(last.joints**2, axis=0), np.inf)
@@ -723,7 +727,7 @@ def _changed_joints(
     tool = 0.5 * float(np.sum((last.tool @ shift) ** 2)) / variance - np.log(len(step))
     top = max(float(gains.max()), tool)
     named = np.flatnonzero(gains > top - np.log(NAMING_ODDS))
-    return tuple(int(one) for one in named), bool(tool > top - np.log(NAMING_ODDS))
+    return tuple(int(entry) for entry in named), bool(tool > top - np.log(NAMING_ODDS))
 
 
 def chosen_poses(
@@ -767,13 +771,13 @@ def chosen_poses(
         while True:
             before = value
             for slot in range(count):
-                others = np.delete(rows, slot)
+                other_rows = np.delete(rows, slot)
                 least = information(
-                    DD[others].sum(axis=0) + DD,
-                    FD[others].sum(axis=0) + FD,
-                    FF[others].sum(axis=0) + FF + ridge,
+                    DD[other_rows].sum(axis=0) + DD,
+                    FD[other_rows].sum(axis=0) + FD,
+                    FF[other_rows].sum(axis=0) + FF + ridge,
                 )[:, able].min(axis=1)
-                least[others] = -1.0
+                least[other_rows] = -1.0
                 rows[slot], value = int(np.argmax(least)), float(least.max())
             if value <= before * (1.0 + 1e-6):
                 break

@@ -124,9 +124,9 @@ class HeldByForm:
             return f' of joint{several} {", ".join(map(str, joints))}' if joints else ''
 
         lines_uncorrectable = [
-            f'Corrected in no form: {left.effect.replace("_", " ")}'
-            f'{of_joints(left.joints)}, {left.size_mm:.3f} mm RMS: {left.instead}'
-            for left in self.uncorrectable
+            f'Corrected in no form: {error.effect.replace("_", " ")}'
+            f'{of_joints(error.joints)}, {error.size_mm:.3f} mm RMS: {error.instead}'
+            for error in self.uncorrectable
         ]
         if not self.parts:
             return ['Left out: nothing that can be corrected.', *lines_uncorrectable]
@@ -174,16 +174,18 @@ def form_content(compensation: Compensation, form: Form, rng: np.random.Generato
     q = rng.uniform(low, high, (COMPARED, k))
     sensor, marker = next(iter(model.T_R_N)), next(iter(model.markers))
 
-    def place(one: ArmModel) -> FloatArray:
-        return one.in_sensor(one.state(q), sensor, marker)
+    def place(arm: ArmModel) -> FloatArray:
+        return arm.in_sensor(arm.state(q), sensor, marker)
 
     wanted, turn = place(model), model.T_R_N[sensor][:3, :3]
     free = np.zeros(len(plain.parameter_names), dtype=bool)
     free[:k] = known
     for where in (*plain.registration(sensor), plain.marker(marker)):
         free[where] = True
-    own = set(np.array(model.chain.joint_names)[~prismatic])
-    of_geometry = np.array([_of_geometry(name) in own for name in plain.parameter_names])
+    revolute_names = set(np.array(model.chain.joint_names)[~prismatic])
+    of_geometry = np.array(
+        [_of_geometry(name) in revolute_names for name in plain.parameter_names]
+    )
     free |= of_geometry & with_geometry
     total = np.zeros(len(free))
     for _ in range(STEPS):
@@ -203,8 +205,8 @@ def form_content(compensation: Compensation, form: Form, rng: np.random.Generato
         plain = plain.with_step(step)
     displacement = np.linalg.norm(wanted - place(plain), axis=1)
     parts = tuple(
-        Part(what, 1e3 * float(np.sqrt(np.mean(np.sum((wanted - place(one)) ** 2, axis=1)))))
-        for what, one in _models_without_parts(model, form)
+        Part(what, 1e3 * float(np.sqrt(np.mean(np.sum((wanted - place(arm)) ** 2, axis=1)))))
+        for what, arm in _models_without_parts(model, form)
     )
     return HeldByForm(
         plain,

@@ -72,8 +72,8 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
     for rate in RATES:
         # Variance of the slope over that with its prior.
         kept = 1.0 / (1.0 + rate**2 * squares_of_line)
-        left = np.maximum(1.0 - share * (1.0 - kept), 1e-300)
-        odds += np.sqrt(kept) * left ** (-0.5 * (T - 1.0)) / len(RATES)
+        residual_share = np.maximum(1.0 - share * (1.0 - kept), 1e-300)
+        odds += np.sqrt(kept) * residual_share ** (-0.5 * (T - 1.0)) / len(RATES)
     odds = np.where(is_any, odds, 1.0)
     prior = np.full(T - 1, FROM_THE_FIRST)
     later = onsets[1:].astype(float)

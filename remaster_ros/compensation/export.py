@@ -281,11 +281,11 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
                     f'    ({step.joint} keeps its zero in the URDF; what the pad shows goes with '
                     'the joint that it is coupled to)'
                 )
-    others = [step for step in steps if step.set_to != 0.0 and step.zero_in_reach]
-    if others:
+    zero_steps = [step for step in steps if step.set_to != 0.0 and step.zero_in_reach]
+    if zero_steps:
         rows += [
             '  Where the controller sets nothing but 0, drive instead to',
-            *(f'    {step.pad_name}: {step.to_set_zero} {step.unit}' for step in others),
+            *(f'    {step.pad_name}: {step.to_set_zero} {step.unit}' for step in zero_steps),
         ]
     rows += [
         f'  {step.pad_name}: its zero is beyond its limits; a controller that sets nothing but 0 '

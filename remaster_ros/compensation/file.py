@@ -418,8 +418,8 @@ def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
     if isinstance(value, int | float):
         yield where, value
     elif not isinstance(value, str | None):
-        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _numbers(one, f'{where}.{key}')
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _numbers(item, f'{where}.{key}')
 
 
 def _model(content: CompensationPart) -> ArmModel:
@@ -451,8 +451,8 @@ def _model(content: CompensationPart) -> ArmModel:
         if UNSET in (getattr(joint, f'offset_{unit}'), getattr(joint, f'range_{unit}')):
             raise _broken(f'joints.{joint.joint}', f'has no offset_{unit} or no range_{unit}')
     pad = {} if content.controller is None else content.controller.joints
-    told = [*pad, *(other for joint in pad.values() for other in joint.coupling)]
-    if any(name not in names for name in told):
+    pad_joints = [*pad, *(other for joint in pad.values() for other in joint.coupling)]
+    if any(name not in names for name in pad_joints):
         raise _broken('controller', 'names joints that are none of the arm')
     if coupled_in_circle({name: joint.coupling for name, joint in pad.items()}):
         raise _broken('controller', 'couples a joint to itself')

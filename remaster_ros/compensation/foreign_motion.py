@@ -296,7 +296,7 @@ def _refuse_bad_numbers(wanted: Trajectory) -> None:
     Also for a trajectory of over an hour (`LONGEST_S`).
     """
     t, q, v = wanted.times_s, wanted.positions, wanted.velocities
-    if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
+    if not all(np.all(np.isfinite(values)) for values in (t, q, v) if values is not None):
         raise InputError('a number of it is not finite')
     if t[0] < 0.0 or np.any(np.diff(t) <= 0.0):
         raise InputError('its times do not ascend from 0 on')

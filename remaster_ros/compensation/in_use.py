@@ -133,7 +133,7 @@ class CorrectionInUse:
         """
         frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
-        steps = [_steps(one) for one in (frames, rigid)]
+        steps = [_steps(arm_frames) for arm_frames in (frames, rigid)]
         turns = matrix_to_rotation_vector(
             np.swapaxes(steps[1][..., :3, :3], -1, -2) @ steps[0][..., :3, :3]
         )
@@ -179,9 +179,10 @@ class CorrectionInUse:
                 'are taken, as it was measured'
             )
         before = state.get('correction')
-        if before and not (one := Correction(**before)).is_beside:
+        if before and not (correction := Correction(**before)).is_beside:
             lines.append(
-                f'{self.path}: was measured with a correction on ({one}), which must still be on'
+                f'{self.path}: was measured with a correction on ({correction}), which must '
+                'still be on'
             )
         return lines
 
@@ -223,12 +224,12 @@ class CorrectionInUse:
         refused |= self.too_large(change)
         notes = []
         for row in map(int, np.flatnonzero(finite)):
-            left = done.residual_m[row], done.residual_rad[row]
+            residual = done.residual_m[row], done.residual_rad[row]
             if done.incomplete[row]:
                 notes.append(
                     f'solution {row} is near a singularity: of its pose '
-                    f'{1e3 * left[0]:.3f} mm and {np.degrees(left[1]):.4f} degrees are not '
-                    'corrected'
+                    f'{1e3 * residual[0]:.3f} mm and {np.degrees(residual[1]):.4f} degrees are '
+                    'not corrected'
                 )
             if done.outside_range[row]:
                 notes.append(
@@ -253,15 +254,15 @@ def _refuse_another_arm(
             f'{found.path}: is of another URDF (checksum {robot.urdf_sha256[:8]}) than '
             f'{urdf_file} ({sha256[:8]}); give the one that was measured with this description'
         )
-    for what, its, own in (
+    for what, its, cell_value in (
         ('base link', robot.base_link, chain.base_link),
         ('tip link', robot.tip_link, chain.tip_link),
         ('joints', ', '.join(robot.joint_names), ', '.join(chain.joint_names)),
     ):
-        if its != own:
+        if its != cell_value:
             raise InputError(
-                f"{found.path}: its {what} ({its}) differ from the cell's ({own}); give the one "
-                'that was measured with this cell'
+                f"{found.path}: its {what} ({its}) differ from the cell's ({cell_value}); give "
+                'the one that was measured with this cell'
             )
 
 

@@ -77,9 +77,9 @@ def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) 
     last = -1
     for row, angles in enumerate(q):
         known = np.array(places).reshape(-1, len(angles))
-        near = np.flatnonzero(is_same_pose(model.chain, known, angles))
-        at = int(near[0]) if len(near) else len(places)
-        if not len(near):
+        matches = np.flatnonzero(is_same_pose(model.chain, known, angles))
+        at = int(matches[0]) if len(matches) else len(places)
+        if not len(matches):
             places.append(angles)
             visits.append([])
         if at == last:
@@ -94,12 +94,12 @@ def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) 
     attained = [np.array([position[rows].mean(axis=0) for rows in each]) for each in enough]
     centres = np.array([points.mean(axis=0) for points in attained])
     rows = [np.concatenate(each) for each in enough]
-    tool = model.chain.forward(np.array([commanded[some].mean(axis=0) for some in rows]))
+    tool = model.chain.forward(np.array([commanded[group].mean(axis=0) for group in rows]))
     points = apply(tool, model.markers[most[1]])
     T_R_N, _ = register_points(points, centres)
     distances = [
-        np.linalg.norm(some - centre, axis=1)
-        for some, centre in zip(attained, centres, strict=True)
+        np.linalg.norm(group - centre, axis=1)
+        for group, centre in zip(attained, centres, strict=True)
     ]
     return IsoFigures(
         counts,

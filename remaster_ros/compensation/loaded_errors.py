@@ -69,5 +69,5 @@ def without_errors_of_measuring(fit: FitResult, parameters: slice | FloatArray) 
     z[model.core :][parameters] = 0.0
     if fit.found is None or np.array_equal(z, after):
         return measured
-    whole, less = (predicted_rows(fit.found.problem, model, at) for at in (after, z))
-    return np.asarray(measured - (whole - less))
+    prediction, less = (predicted_rows(fit.found.problem, model, at) for at in (after, z))
+    return np.asarray(measured - (prediction - less))

@@ -118,8 +118,10 @@ def mastering(
         name = chain.joint_names[i]
         shown = joints.get(name, PadJoint(name))
         # Of another one that is coupled to it as well.
-        told = shown.coupling or shown.sign != 1 or shown.zero_deg or change[i] != applied[i]
-        if chain.slides[i] and told:
+        pad_setting = (
+            shown.coupling or shown.sign != 1 or shown.zero_deg or change[i] != applied[i]
+        )
+        if chain.slides[i] and pad_setting:
             raise InputError(
                 f"joint '{name}' slides, and the session's controller has a sign, a zero or a "
                 'coupling of it, which are of angles: take that joint out of controller'

@@ -364,9 +364,9 @@ def _model(
         elif slot.kind == 'lateral':
             lateral[slot.joint] = value[0]
         else:
-            one = geometry if slot.kind == 'geometry' else growth
-            one.shifts[slot.joint] = value[:3]
-            one.turns[slot.joint] = value[3:]
+            target = geometry if slot.kind == 'geometry' else growth
+            target.shifts[slot.joint] = value[:3]
+            target.turns[slot.joint] = value[3:]
     return ArmModel(
         chain=chain,
         joint_offsets=np.zeros(joints),

@@ -151,9 +151,9 @@ def smooth_changes(
         far = np.any((np.abs(state[:, 0]) > limits.change) & ~fixed[:, 0], axis=1)
         if over.max() > 1.0 or far.any():
             # A weight of an interval alone would only move what is too much to the next ones.
-            near = scipy.ndimage.maximum_filter1d(over, 2 * NEIGHBOURS + 1)
-            factor = np.clip(near**2, HEAVIER[0], HEAVIER[1])
-            weight = np.where(near > 1.0, factor, 1.0)[:, None] * weight
+            local_max = scipy.ndimage.maximum_filter1d(over, 2 * NEIGHBOURS + 1)
+            factor = np.clip(local_max**2, HEAVIER[0], HEAVIER[1])
+            weight = np.where(local_max > 1.0, factor, 1.0)[:, None] * weight
             pull = np.where(far, np.maximum(PULL_HEAVIER * pull, FIRST_PULL), pull)
         elif np.abs(step[:, 0]).max() < CONVERGED_RAD:
             break
@@ -222,17 +222,17 @@ def _step(
     of_bends = np.einsum('nkab,nbk->nak', bent, np.concatenate((state[:-1], state[1:]), axis=1))
     slope[:-1] += of_bends[:, :2]
     slope[1:] += of_bends[:, 2:]
-    diagonal, beside = np.zeros((n, 2, k, 2, k)), np.zeros((n - 1, 2, k, 2, k))
+    diagonal, off_diagonal = np.zeros((n, 2, k, 2, k)), np.zeros((n - 1, 2, k, 2, k))
     diagonal[:, 0, :, 0, :] = on_change
     joint = np.arange(k)
     # (k, n, 2, 2) is what NumPy makes of two index arrays with slices between them.
     diagonal[:-1, :, joint, :, joint] += bent[:, :, :2, :2].swapaxes(0, 1)
     diagonal[1:, :, joint, :, joint] += bent[:, :, 2:, 2:].swapaxes(0, 1)
-    beside[:, :, joint, :, joint] = bent[:, :, :2, 2:].swapaxes(0, 1)
+    off_diagonal[:, :, joint, :, joint] = bent[:, :, :2, 2:].swapaxes(0, 1)
     size = 2 * k
     free = ~fixed.reshape(n, size)
     own_block = diagonal.reshape(n, size, size) * (free[:, :, None] & free[:, None, :])
-    next_block = beside.reshape(n - 1, size, size) * (free[:-1, :, None] & free[1:, None, :])
+    next_block = off_diagonal.reshape(n - 1, size, size) * (free[:-1, :, None] & free[1:, None, :])
     place = np.arange(size)
     own_block[:, place, place] += ~free
     right = np.where(free, -slope.reshape(n, size), 0.0)

@@ -122,7 +122,7 @@ def static_transforms(
                 base, child, there.translation_m, there.rotation_xyzw, _std(moved), _std(turn)
             )
         )
-    names = [base, tip, *(one.child for one in found)]
+    names = [base, tip, *(transform.child for transform in found)]
     for name in names:
         if not FRAME.fullmatch(name):
             raise InputError(
@@ -143,23 +143,24 @@ def transform_files(transforms: list[StaticTransform]) -> dict[str, str]:
     """Launch file and tf2_msgs/TFMessage (YAML) of static transforms, name -> text."""
     nodes = [
         f'  <node pkg="tf2_ros" exec="static_transform_publisher" '
-        f'name={quoteattr(_node_name(one.child))}\n        args={quoteattr(one.arguments)}/>'
-        for one in transforms
+        f'name={quoteattr(_node_name(transform.child))}\n'
+        f'        args={quoteattr(transform.arguments)}/>'
+        for transform in transforms
     ]
-    comment = [f'  {line}' for line in (*_HEAD, *(one.words for one in transforms))]
+    comment = [f'  {line}' for line in (*_HEAD, *(transform.words for transform in transforms))]
     launch = ['<launch>', '  <!--', *comment, '  -->', *nodes, '</launch>', '']
     lines = [
         *(f'# {line}' for line in _HEAD),
         '# A tf2_msgs/TFMessage for /tf_static (durability transient_local).',
         'transforms:',
     ]
-    for one in transforms:
-        x, y, z = one.translation_m
-        qx, qy, qz, qw = one.rotation_xyzw
+    for transform in transforms:
+        x, y, z = transform.translation_m
+        qx, qy, qz, qw = transform.rotation_xyzw
         lines += [
-            f'# {one.words}',
-            f"- header: {{frame_id: '{one.parent}'}}",
-            f"  child_frame_id: '{one.child}'",
+            f'# {transform.words}',
+            f"- header: {{frame_id: '{transform.parent}'}}",
+            f"  child_frame_id: '{transform.child}'",
             '  transform:',
             f'    translation: {{x: {x:.9f}, y: {y:.9f}, z: {z:.9f}}}',
             f'    rotation: {{x: {qx:.9f}, y: {qy:.9f}, z: {qz:.9f}, w: {qw:.9f}}}',

@@ -231,7 +231,7 @@ def _checked(
                 f'trajectory: {what} have the shape {values.shape}, not {shape}; give each point '
                 'all joints, and all points velocities or none'
             )
-    if not all(np.all(np.isfinite(one)) for one in (t, q, v) if one is not None):
+    if not all(np.all(np.isfinite(array)) for array in (t, q, v) if array is not None):
         raise InputError('trajectory: a number is not finite; correct it')
     if len(t) < 2 or np.any(np.diff(t) < LEAST_S):
         raise InputError('trajectory: needs two points or more, at times that ascend')
@@ -342,7 +342,7 @@ def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
     """
     ends = accelerations.reshape(-1, accelerations.shape[2])
     first = 2 * knots[:-1]
-    high, low = (np.asarray(one.reduceat(ends, first)) for one in (np.maximum, np.minimum))
+    high, low = (np.asarray(ufunc.reduceat(ends, first)) for ufunc in (np.maximum, np.minimum))
     largest = np.where(high > -low, high, low)
     found = np.stack((largest, largest), axis=1)
     single = np.diff(knots) == 1
@@ -368,7 +368,7 @@ def _deviation_between(
     nominal = model.chain.forward(wanted.at(at))[:, :3, 3]
     off = compensator.tool(sent.at(at), temperature_c)[:, :3, 3] - nominal
     off, between = np.split(off, [len(knots)])
-    expected = [np.interp(inside.ravel(), times[knots], one) for one in off.T]
+    expected = [np.interp(inside.ravel(), times[knots], coordinate) for coordinate in off.T]
     deviation = np.linalg.norm(between - np.stack(expected, axis=1), axis=1)
     return np.asarray(deviation.reshape(inside.shape))
 

@@ -126,7 +126,7 @@ def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
     off = None
     if len(off_rows) and 3 * len(off_rows) > on.base_columns + 3:
         off = _ProjectedRows(compensator, visits, off_rows).error()
-    left = on.projected(on.measured - on.at['in_use'])
+    residual = on.projected(on.measured - on.at['in_use'])
     poses = None
     if absolute.verdict == 'unclear':
         poses = _poses(on, rivals)
@@ -137,7 +137,7 @@ def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
         dict(zip(compensator.joint_names, joints, strict=True)),
         on.error(),
         off,
-        1e3 * float(np.sqrt(3.0 * left @ left / len(left))),
+        1e3 * float(np.sqrt(3.0 * residual @ residual / len(residual))),
         noise,
         poses,
     )
@@ -160,7 +160,7 @@ class _ProjectedRows:
         tool = self.model.chain.forward(self.wanted)[:, :3, :3]
         columns = []
         for sensor in dict.fromkeys(sensors):
-            selection = np.array([one == sensor for one in sensors])
+            selection = np.array([label == sensor for label in sensors])
             T, _ = register_points(nominal[selection], visits.position[rows][selection])
             measured[selection] = apply(T, visits.position[rows][selection])
             frame = np.zeros((len(rows), 3, 6))
@@ -170,13 +170,13 @@ class _ProjectedRows:
             )
             columns.append(frame)
         for marker in dict.fromkeys(self.markers):
-            selection = np.array([one == marker for one in self.markers])
+            selection = np.array([label == marker for label in self.markers])
             columns.append(tool * selection[:, None, None])
         self.nominal, self.measured = nominal, measured.ravel()
         free = np.concatenate(columns, axis=2).reshape(3 * len(rows), -1)
-        left, sizes, _ = np.linalg.svd(free)
+        vectors, sizes, _ = np.linalg.svd(free)
         self.base_columns = int(np.sum(sizes > 1e-9 * sizes[0]))
-        self._complement = left[:, self.base_columns :]
+        self._complement = vectors[:, self.base_columns :]
 
     def seen(self, q: FloatArray) -> FloatArray:
         """Positions of the markers at commanded angles (n, k), in R, m, (n, 3), by the model."""
@@ -213,7 +213,7 @@ class _ProjectedRows:
         sensor, state = next(iter(self.model.T_R_N)), self.model.state(q)
         found = np.zeros((len(q), 3, len(self.model.parameter_names)))
         for marker in dict.fromkeys(self.markers):
-            selection = np.array([one == marker for one in self.markers])
+            selection = np.array([name == marker for name in self.markers])
             found[selection] = self.model.derivative(state, sensor, marker)[selection]
         return found
 
@@ -249,8 +249,8 @@ def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
 
     Its covariance is σ² plus that of standard normal coefficients of ``columns`` (d, m).
     """
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    along = left.T @ residual
+    vectors, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    along = vectors.T @ residual
     outside_squares = max(0.0, float(residual @ residual - along @ along))
     var = SIGMAS[:, None] ** 2
     wide = var + sizes**2
@@ -295,8 +295,8 @@ def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[Floa
     share, std = _shares(side, best, sigma, whole=True)
     joint_shares, stds = _shares(side, best, sigma, whole=False)
     joints = [
-        Estimate(float(one), float(s), _state_of_share(float(one), float(s)))
-        for one, s in zip(joint_shares, stds, strict=True)
+        Estimate(float(joint_share), float(s), _state_of_share(float(joint_share), float(s)))
+        for joint_share, s in zip(joint_shares, stds, strict=True)
     ]
     return Estimate(float(share[0]), float(std[0]), verdict), joints, rivals
 
@@ -431,8 +431,8 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
     precision = float(move @ inverse @ move)
     share = float(move @ inverse @ difference) / precision
     verdict = _decided({s: _integrated(v) for s, v in states.items()}, _integrated(other))
-    left = difference - share * move
-    noise = 1e3 * float(np.sqrt(3.0 * left @ left / (len(left) - 1) / 2.0))
+    residual = difference - share * move
+    noise = 1e3 * float(np.sqrt(3.0 * residual @ residual / (len(residual) - 1) / 2.0))
     return Estimate(share, precision**-0.5, verdict), noise
 
 

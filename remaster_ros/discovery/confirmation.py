@@ -184,16 +184,16 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
     both = _Both.of(discovery, estimate(Problem.of(session)), rng)
     both, best = both.most_likely()
     rows = len(both.there.data.context)
-    told = [both.told(group) for group in both.groups]
+    common_rows = [both.told(group) for group in both.groups]
     causes = tuple(
-        both.judged(best, index, told[index], effect)
-        for index, effect in zip(range(len(told)), discovery.effects, strict=False)
+        both.judged(best, index, common_rows[index], effect)
+        for index, effect in zip(range(len(common_rows)), discovery.effects, strict=False)
     )
     every = [i for group in both.groups for i in group]
-    seen = np.all([np.ones(rows, dtype=bool), *told], axis=0)
+    seen = np.all([np.ones(rows, dtype=bool), *common_rows], axis=0)
     error = partial(both.error, rows=seen)
-    before, after, own = error(absent=every), error(frozen=every), error()
-    carried = share_of_gain(before, after, own)
+    before, after, own_rms = error(absent=every), error(frozen=every), error()
+    carried = share_of_gain(before, after, own_rms)
     why = ''
     if causes and all(cause.answer == 'open' for cause in causes):
         why = (
@@ -202,7 +202,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
             'confirmed. Measure the arm where this session did.'
         )
     with_causes = both.here.data.context.joint_offsets + both.alone.values[: both.joints]
-    others = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is not None)
+    other_joints = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is not None)
     undetermined = tuple(j + 1 for j in both.own(best) if both.offsets(best, j) is None)
     side_by_side = both.offsets_side_by_side(discovery, best)
     return Confirmation(
@@ -210,7 +210,7 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
         rows_common=int(seen.sum()),
         rms_before_m=before,
         rms_after_m=after,
-        rms_own_m=own,
+        rms_own_m=own_rms,
         rms_frozen_offsets_m=min(
             error(absent=every, joint_offsets=discovery.offsets_before[0]),
             error(frozen=every, joint_offsets=with_causes),
@@ -220,10 +220,10 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
         joint_offsets=side_by_side,
         offsets_rms_sigmas=rms_sigmas(side_by_side),
         parameters_rms_sigmas=rms_sigmas([row for cause in causes for row in cause.parameters]),
-        confirmed=not others and carried is not None and carried > 0.5 and not why,
-        same_offsets=not others,
+        confirmed=not other_joints and carried is not None and carried > 0.5 and not why,
+        same_offsets=not other_joints,
         why=why,
-        other_joints=others,
+        other_joints=other_joints,
         open_joints=undetermined,
         differ_by=float(np.sqrt(both.share)),
     )
@@ -263,21 +263,21 @@ class _Measured:
         data: Residuals,
         noise: Noise,
         candidates: Sequence[Candidate],
-        alone: Sequence[_Weighted],
+        nuisance: Sequence[_Weighted],
     ) -> _Measured:
-        """Assemble the equations of rows, with the candidates `alone` marginalised."""
+        """Assemble the equations of rows, with the candidates `nuisance` marginalised."""
         natural = data.full_jacobian[data.rows.source]
-        further = data.columns([candidate for candidate, _ in alone])
+        further = data.columns([candidate for candidate, _ in nuisance])
         parts = natural, data.columns(candidates), data.errors[:, :, None], further
         columns = np.concatenate(parts, axis=2)
         grams = data.noise_model.gram(lambda _, where: columns[where], columns.shape[2])
         total = np.tensordot(1.0 / data.noise_model.variances(noise), grams, axes=1)
         known = columns.shape[2] - further.shape[2]
         plain, across = total[:known, :known], total[known:, :known]
-        if not alone:
+        if not nuisance:
             return cls(data, plain, plain)
-        own = total[known:, known:] + block_diag(*(prior for _, prior in alone))
-        return cls(data, plain - across.T @ _solved(own, across), plain)
+        precision = total[known:, known:] + block_diag(*(prior for _, prior in nuisance))
+        return cls(data, plain - across.T @ _solved(precision, across), plain)
 
     @property
     def size(self) -> int:
@@ -291,9 +291,9 @@ class _Measured:
         """
         where = slice(self.size, self.size + len(precision))
         across = self.products[where]
-        own = across[:, where] + precision
-        loss = 0.5 * (np.linalg.slogdet(own)[1] - np.linalg.slogdet(precision)[1])
-        return self.products - across.T @ _solved(own, across), float(loss)
+        arm_block = across[:, where] + precision
+        loss = 0.5 * (np.linalg.slogdet(arm_block)[1] - np.linalg.slogdet(precision)[1])
+        return self.products - across.T @ _solved(arm_block, across), float(loss)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,12 +343,16 @@ class _Both:
         theirs = theirs.only(draw_rows(fit.problem.measurements, fit.kept, rng))
         named = [candidate for group in discovery.groups for candidate in group]
         names = {name for candidate in named for name in candidate.parameters}
-        others = [c for c in discovery.solution.candidates if not names & set(c.parameters)]
+        other_candidates = [
+            c for c in discovery.solution.candidates if not names & set(c.parameters)
+        ]
         causes = [candidate for candidate in named if not candidate.happened]
-        found = causes + [candidate for candidate in others if not candidate.of_measurement]
-        once = [c for c in named if c.happened] + [c for c in others if c.of_measurement]
+        found = causes + [
+            candidate for candidate in other_candidates if not candidate.of_measurement
+        ]
+        once = [c for c in named if c.happened] + [c for c in other_candidates if c.of_measurement]
         candidates = [widened(candidate, mine.part, theirs.part) for candidate in found]
-        noise, alone = _by_itself(theirs, candidates[: len(causes)])
+        noise, nuisance = _by_itself(theirs, candidates[: len(causes)])
         priors = [_prior(discovery, *pair) for pair in zip(found, candidates, strict=True)]
         of_once = [(candidate, _prior(discovery, candidate, candidate)) for candidate in once]
         return cls(
@@ -359,7 +363,7 @@ class _Both:
                 for group in discovery.groups
             ),
             _Measured.of(mine, discovery.solution.noise, candidates, of_once),
-            _Measured.of(theirs, noise, candidates, alone),
+            _Measured.of(theirs, noise, candidates, nuisance),
             np.reshape(block_diag(*priors), [sum(candidate.size for candidate in candidates)] * 2),
             fit,
             np.asarray(discovery.fit.identifiable),
@@ -383,16 +387,16 @@ class _Both:
         per_radian = self.fit.model.chain.per_radian
         prior = block_diag(np.diag(_natural(second, per_radian)), self.precision)
         to = np.concatenate((np.arange(k), np.full(second - k, -1), here.size + np.arange(m)))
-        own = [np.arange(k, second)]
+        own_indices = [np.arange(k, second)]
         wheres = [*np.arange(k)[:, None], *(second + self.where(group) for group in self.groups)]
         for where, choice in zip(wheres, choices, strict=True):
             to[where] = -1 if choice == 'absent' else to[where]
-            own += [where] if choice == 'own' else []
+            own_indices += [where] if choice == 'own' else []
         at = first
-        for where in own:
+        for where in own_indices:
             to[where] = at + np.arange(len(where))
             at += len(where)
-        blocks = [prior[np.ix_(where, where)] for where in own]
+        blocks = [prior[np.ix_(where, where)] for where in own_indices]
         H = block_diag(np.diag(_natural(here.size, per_radian)), self.precision, *blocks)
         h = np.zeros(at)
         H[:first, :first] += here.products[:-1, :-1]
@@ -428,10 +432,10 @@ class _Both:
         possible = [CHOICES[:2]] * self.joints
         possible += [CHOICES if group else ('shared',) for group in self.groups]
         both, best = self, tuple(choices[0] for choices in possible)
-        others = [self, *(replace(self, share=share) for share in SHARES)]
+        alternatives = [self, *(replace(self, share=share) for share in SHARES)]
         value = both.fitted(best).log_evidence
         while True:
-            tried = [(other, best) for other in others if other is not both]
+            tried = [(other, best) for other in alternatives if other is not both]
             tried += [
                 (both, _with(best, i, choice))
                 for i, choices in enumerate(possible)
@@ -500,28 +504,28 @@ class _Both:
         the fitted ones without any; of those in ``rows`` (all rows,), where there are such.
         """
         there, k, size = self.there, self.joints, self.there.size
-        held = np.full(size + len(self.precision), np.nan)
+        parameters = np.full(size + len(self.precision), np.nan)
         if joint_offsets is not None:
-            held[:k] = joint_offsets - there.data.context.joint_offsets
+            parameters[:k] = joint_offsets - there.data.context.joint_offsets
         found = self.alone.values[self.here.size :][: len(self.precision)]
-        told = np.diag(self._spread) < HALF**2 * np.diag(np.linalg.inv(self.precision))
+        is_determined = np.diag(self._spread) < HALF**2 * np.diag(np.linalg.inv(self.precision))
         for candidates, values in ((absent, 0.0 * found), (frozen, found)):
             where = self.where(candidates)
-            where = where[told[where]]
-            held[size + where] = values[where]
-        free, fixed = np.isnan(held), ~np.isnan(held)
+            where = where[is_determined[where]]
+            parameters[size + where] = values[where]
+        free, fixed = np.isnan(parameters), ~np.isnan(parameters)
         H = there.plain[:-1, :-1] + block_diag(np.diag(_natural(size)), self.precision)
-        h = there.plain[:-1, -1][free] - H[np.ix_(free, fixed)] @ held[fixed]
-        held[free] = _solved(H[np.ix_(free, free)], h)
+        h = there.plain[:-1, -1][free] - H[np.ix_(free, fixed)] @ parameters[fixed]
+        parameters[free] = _solved(H[np.ix_(free, free)], h)
         data = there.data
-        left = data.full_errors - data.full_jacobian @ held[:size]
-        left -= data.displaced(self.candidates, held[size:])
+        residuals = data.full_errors - data.full_jacobian @ parameters[:size]
+        residuals -= data.displaced(self.candidates, parameters[size:])
         judged = data.context.measurements.is_validation
         if not judged.any():
             judged = np.isin(np.arange(len(judged)), data.rows.source)
         if rows is not None and np.any(judged & rows):
             judged = judged & rows
-        return rms(left, judged)
+        return rms(residuals, judged)
 
     def own(self, best: Choices) -> list[int]:
         """Return the joints (from 0) whose zero-offset differs between the sessions."""
@@ -552,7 +556,7 @@ class _Both:
                 rows += _compared([name], unit, scale * pair[0], scale**2 * pair[1])
         return tuple(rows)
 
-    def _side_by_side(self, group: Sequence[int], own: _Fitted) -> tuple[Compared, ...]:
+    def _side_by_side(self, group: Sequence[int], fit: _Fitted) -> tuple[Compared, ...]:
         """Compare the parameters of a cause, of a curve its heights at the places seen in both."""
         rows: list[Compared] = []
         for i in group:
@@ -572,10 +576,10 @@ class _Both:
                     continue
                 heights = wide.curve.columns(places[seen])
                 heights = np.kron(heights - heights.mean(axis=0), np.eye(axes))
-            both = np.append(self.here.size + where, own.there[self.there.size + where])
+            both = np.append(self.here.size + where, fit.there[self.there.size + where])
             twice = block_diag(heights, heights)
-            covariance = twice @ own.covariance(both) @ twice.T
-            rows += _compared(names, candidate.unit, twice @ own.values[both], covariance)
+            covariance = twice @ fit.covariance(both) @ twice.T
+            rows += _compared(names, candidate.unit, twice @ fit.values[both], covariance)
         return tuple(rows)
 
 
@@ -599,10 +603,10 @@ def _compared(
 
 def answer_of(evidence: Mapping[Choice, float]) -> Answer:
     """Return the answer by the evidence of each choice; 'open' if presence or size is."""
-    shared, own, absent = evidence['shared'], evidence['own'], evidence['absent']
-    if max(own, absent) > shared + NEEDED:
-        return 'changed' if own > absent + NEEDED else 'absent'
-    if shared < absent + NEEDED or shared < own + HALVED:
+    shared, own_evidence, absent = evidence['shared'], evidence['own'], evidence['absent']
+    if max(own_evidence, absent) > shared + NEEDED:
+        return 'changed' if own_evidence > absent + NEEDED else 'absent'
+    if shared < absent + NEEDED or shared < own_evidence + HALVED:
         return 'open'
     return 'confirmed'
 
@@ -612,23 +616,23 @@ def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, lis
 
     [] for the latter unless all kinds of errors together explain the session better.
     """
-    others = [
+    candidates = [
         candidate
         for effect in effects_of(data.context).values()
         if not effect.moves_the_fit and not effect.needs(data.context)
         for candidate in effect.candidates(data.context)
     ]
     each = [Family.of(data, f'cause {i}', [candidate]) for i, candidate in enumerate(causes)]
-    every = kinds(data, others, causes)
-    found = solve(data, [one.candidate for one in each if one is not None])
+    every = kinds(data, candidates, causes)
+    found = solve(data, [kind.candidate for kind in each if kind is not None])
     if found is None:
         return data.noise, []
     # Of few rows all kinds together would explain the noise as well.
-    whole = solve(data, [*found.candidates, *(one.candidate for one in every)], found)
-    if whole is None or whole.log_evidence < found.log_evidence + NAMED:
+    full_solution = solve(data, [*found.candidates, *(kind.candidate for kind in every)], found)
+    if full_solution is None or full_solution.log_evidence < found.log_evidence + NAMED:
         return found.noise, []
-    weights = whole.weight_precisions()
-    return whole.noise, [
+    weights = full_solution.weight_precisions()
+    return full_solution.noise, [
         (family.candidate, weights[family.candidate] * np.eye(family.candidate.size))
         for family in every
         if family.members[0].of_measurement
@@ -737,14 +741,14 @@ def require_other_session(session: Session, other: Session) -> None:
         raise InputError(
             "the other session's URDF has another geometry; confirm with the same arm"
         )
-    for kind, own, others in (
+    for kind, own_names, other_names in (
         ('sensors', mine.sensor_names, theirs.sensor_names),
         ('markers', mine.marker_names, theirs.marker_names),
     ):
-        if own != others:
+        if own_names != other_names:
             raise InputError(
-                f'the other session has the {kind} {", ".join(others)}, not {", ".join(own)}; '
-                'confirm with a session of the same cell'
+                f'the other session has the {kind} {", ".join(other_names)}, not '
+                f'{", ".join(own_names)}; confirm with a session of the same cell'
             )
     rows = len(other.measurements)
     equal = len(_readings(session) & _readings(other))
@@ -789,18 +793,19 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
         f'average, and the error is {1e3 * found.rms_frozen_offsets_m:.3f} mm RMS with those '
         'found here'
     )
-    own = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
+    own_error = f'{1e3 * min(found.rms_own_m, found.rms_before_m):.3f} mm with its own'
     holds = any(cause.answer == 'confirmed' for cause in found.effects)
     if not found.same_offsets and not holds and not found.carries_over:
         return [
-            f'The zero-offsets found here are not those of the other session: {offsets}, {own}. '
-            'That is another arm, or it was mastered anew in between: nothing is confirmed.'
+            f'The zero-offsets found here are not those of the other session: {offsets}, '
+            f'{own_error}. That is another arm, or it was mastered anew in between: nothing is '
+            'confirmed.'
         ]
     if not found.same_offsets:
         lines.append(
             f'Of {joint_words(found.other_joints)} the zero-offset is another one there: '
-            f'{offsets}, {own}. That is another arm of this kind, or it was mastered anew in '
-            'between, or what imitates an offset has changed.'
+            f'{offsets}, {own_error}. That is another arm of this kind, or it was mastered anew '
+            'in between, or what imitates an offset has changed.'
         )
     elif found.joint_offsets:
         lines.append(f'The zero-offsets are the same, {offsets}: it is the same arm.')

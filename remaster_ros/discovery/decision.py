@@ -96,7 +96,9 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
         return Decision.of(cause, look_alike, 'neither')
     # What cannot be fitted beside the rest explains nothing.
     bare = _without(found, cause, look_alike)
-    first, second = (bare if one is None else max(one, bare) for one in (first, second))
+    first, second = (
+        bare if evidence is None else max(evidence, bare) for evidence in (first, second)
+    )
     difference = first - second
     winner = cause if difference > 0.0 else look_alike
     decided = abs(difference) > NEEDED and winner in named
@@ -112,7 +114,11 @@ def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
     kinds = {cause.name for cause in causes}
     have = {name for candidate in named for name in candidate.parameters}
     return (
-        *(candidate for candidate in named if not any(_belongs(candidate, one) for one in causes)),
+        *(
+            candidate
+            for candidate in named
+            if not any(_belongs(candidate, target) for target in causes)
+        ),
         *(
             family.candidate
             for family in found.background
@@ -132,21 +138,21 @@ def _belongs(candidate: Candidate, cause: Named) -> bool:
 
 def _without(found: Discovery, *causes: Named) -> float:
     """Log evidence of the discovery's model without some causes; -inf if it has no solution."""
-    rest = _rest(found, *causes)
-    bare = solve(found.residuals, rest, found.solution)
+    remaining = _rest(found, *causes)
+    bare = solve(found.residuals, remaining, found.solution)
     return -np.inf if bare is None else bare.log_evidence
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
     """Return the log evidence with a cause in place of another; None if it cannot be fitted."""
-    every, rest = _candidates(found), _rest(found, cause, other)
+    every, remaining = _candidates(found), _rest(found, cause, other)
     named = [candidate for group in found.groups for candidate in group]
     present = tuple(candidate for candidate in named if _belongs(candidate, cause))
-    whole = {joint for candidate in present for joint in candidate.joints} == {*cause.joints}
-    sets = [present] if present and whole else _variants(every, cause)
+    is_complete = {joint for candidate in present for joint in candidate.joints} == {*cause.joints}
+    sets = [present] if present and is_complete else _variants(every, cause)
     best = None
     for candidates in sets:
-        fit = solve(found.residuals, (*rest, *candidates), found.solution)
+        fit = solve(found.residuals, (*remaining, *candidates), found.solution)
         if fit is None or fit.unphysical():
             continue
         if best is None or fit.log_evidence > best:
@@ -160,15 +166,15 @@ def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate,
     If there are none, one candidate for each of the joints together; [] if a joint has none.
     """
     mine = [candidate for candidate in every if candidate.name == cause.name]
-    one: list[tuple[Candidate, ...]] = [
+    singles: list[tuple[Candidate, ...]] = [
         (candidate,) for candidate in mine if candidate.joints == cause.joints
     ]
     each = [
         [c for c in mine if c.joints == (joint,) and EFFECTS[c.name].in_family(c)][:1]
         for joint in cause.joints
     ]
-    if one or not all(each):
-        return one
+    if singles or not all(each):
+        return singles
     return [tuple(candidate for candidates in each for candidate in candidates)]
 
 

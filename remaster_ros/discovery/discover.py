@@ -246,12 +246,12 @@ def discover_session(
         fit, (gain, metrics), if_drawn = sampled(found, data, [(bare, 1.0)], ())
     is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
     structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
-    left, gross = structure_left(data, solution, fit, structure)
-    unexplained += left
+    residual_structure, gross = structure_left(data, solution, fit, structure)
+    unexplained += residual_structure
     causes = [
         (effect.sampled(fit, group, data), group)
-        for effect, group, so in zip(described, groups, is_cause, strict=True)
-        if so
+        for effect, group, has_cause in zip(described, groups, is_cause, strict=True)
+        if has_cause
     ]
     causes.sort(key=lambda cause: -cause[0].size_m)
     effects, groups = zip(*causes, strict=True) if causes else ((), ())
@@ -277,11 +277,11 @@ def discover_session(
         if effect.is_taken_out
         for candidate in group
     ]
-    alone = fit
+    offsets_fit = fit
     # Kinds that nobody named are in no file with zero-offsets either.
     if not {*solution.candidates} <= {*measured}:
         errors = solve(data, measured) if measured else None
-        alone = fit_session(
+        offsets_fit = fit_session(
             session,
             rng=rng,
             clock=clock,
@@ -293,7 +293,7 @@ def discover_session(
     outliers = fit.left_out + gross
     geometry = geometry_model(found, causes=measured)
     if geometry is not None:
-        geometry = geometry.beside(alone, [observation for observation, _ in outliers])
+        geometry = geometry.beside(offsets_fit, [observation for observation, _ in outliers])
     thinning = None
     if len(pool) < len(found.problem.fitted):
         thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)
@@ -314,7 +314,7 @@ def discover_session(
         residuals=data,
         fit=fit,
         residuals_before=residuals_of(before),
-        alone=alone,
+        alone=offsets_fit,
         std_if_drawn=if_drawn,
         geometry=geometry,
         search=record,
@@ -395,10 +395,13 @@ def _judged(
     """
     every = residuals.only(pool)
     gross = None
-    for left in _left_by_moment(every, solution):
+    for errors in _left_by_moment(every, solution):
         try:
             off = find_outliers(
-                every.rows, partial(_residuals_as_given, left), left, found.problem.sensor_names
+                every.rows,
+                partial(_residuals_as_given, errors),
+                errors,
+                found.problem.sensor_names,
             ).gross
         except InsufficientDataError:
             if gross is None:
@@ -424,17 +427,17 @@ def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
 
     Rows just before or after a step look gross where it is dated without them.
     """
-    left = [data.left(solution)]
+    residuals = [data.left(solution)]
     reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
     for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
-        others = [
+        variants = [
             other
             for other in at_other_moments(
                 candidate, data.context, candidate.moment - reach, candidate.moment + reach
             )
             if other.variant == candidate.variant
         ]
-        for other in (others[0], others[-1]) if others else ():
+        for other in (variants[0], variants[-1]) if variants else ():
             moved = data.columns([candidate]) - data.columns([other])
-            left.append(left[0] + moved @ solution.parameters[where])
-    return left
+            residuals.append(residuals[0] + moved @ solution.parameters[where])
+    return residuals

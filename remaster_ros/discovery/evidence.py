@@ -227,8 +227,8 @@ class System:
             ridge = self.ridges[i]
             smooth = np.sum(factor * self.spectra[i] / (factor * self.spectra[i] + ridge))
             quadratic = factor * beta[where] @ penalty @ beta[where]
-            own = inverse[where, where] * penalty
-            spread = factor * (2.0 * np.sum(own) - np.trace(own))
+            product = inverse[where, where] * penalty
+            spread = factor * (2.0 * np.sum(product) - np.trace(product))
             slope[count + i] = 0.5 * (smooth - spread - quadratic)
             turns[where, i] = beta[where]
             if ridge > 0.0:

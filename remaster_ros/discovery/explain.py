@@ -110,10 +110,14 @@ class FoundEffect(Struct, frozen=True):
         index = {name: i for i, name in enumerate(result.theta_names)}
         theta, std = result.theta, result.theta_std
         parameters = tuple(
-            replace(one, value=float(theta[index[one.name]]), std=float(std[index[one.name]]))
-            if one.name in index
-            else one
-            for one in self.parameters
+            replace(
+                parameter,
+                value=float(theta[index[parameter.name]]),
+                std=float(std[index[parameter.name]]),
+            )
+            if parameter.name in index
+            else parameter
+            for parameter in self.parameters
         )
         if data is not None and group:
             draws = result.theta_draws.reshape(-1, len(index))
@@ -139,23 +143,27 @@ class FoundEffect(Struct, frozen=True):
 
         All of them if none does.
         """
-        sigmas = {one.name: abs(one.value) / one.std for one in self.parameters if one.std > 0.0}
+        sigmas = {
+            parameter.name: abs(parameter.value) / parameter.std
+            for parameter in self.parameters
+            if parameter.std > 0.0
+        }
         clear = tuple(
             size
             for size, candidate in zip(self.sizes, group, strict=False)
             if max((sigmas.get(name, np.inf) for name in candidate.parameters), default=np.inf)
             >= CLEAR
         )
-        others = len(self.sizes) - len(clear)
-        if not clear or not others:
+        other_count = len(self.sizes) - len(clear)
+        if not clear or not other_count:
             return self.sizes
-        rest = f'{others} more' if others > 1 else 'one more'
-        return (*clear, f'{rest} within two standard deviations of nothing')
+        words = f'{other_count} more' if other_count > 1 else 'one more'
+        return (*clear, f'{words} within two standard deviations of nothing')
 
     @property
     def sigmas(self) -> float:
         """Largest |value| / std among the parameters."""
-        return clearest((one.value, one.std) for one in self.parameters)
+        return clearest((parameter.value, parameter.std) for parameter in self.parameters)
 
     @property
     def is_certain(self) -> bool:
@@ -184,8 +192,8 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
     """Return the sentence of a cause with its sizes inserted before the first full stop."""
     if not sizes:
         return cause
-    first, stop, rest = cause.partition('. ')
-    return f'{first.removesuffix(".")}: {"; ".join(sizes)}.{" " if stop else ""}{rest}'
+    first, stop, remainder = cause.partition('. ')
+    return f'{first.removesuffix(".")}: {"; ".join(sizes)}.{" " if stop else ""}{remainder}'
 
 
 def describe(
@@ -310,7 +318,7 @@ def _joints(group: Sequence[Candidate]) -> tuple[int, ...]:
 
 def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple[LookAlike, ...]:
     """Return the other causes that models have in the place of a group, the likeliest first."""
-    candidate, own = group[0], max(walk.probability_of(candidate) for candidate in group)
+    candidate, own_chance = group[0], max(walk.probability_of(candidate) for candidate in group)
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
     for other, chance in walk.instead_of(group).items():
         key = (other.name, other.joints)
@@ -321,7 +329,7 @@ def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple
         same = len(group) == 1 and _same(walk.data, candidate, other)
         best[key] = LookAlike(
             *key,
-            float(gain + np.log(chance / max(own, MENTIONED))),
+            float(gain + np.log(chance / max(own_chance, MENTIONED))),
             separate_by(candidate, other, same),
             same,
             len(group) == 1 and candidate.is_shape_of(other),
@@ -408,7 +416,7 @@ class SearchRecord(Struct, frozen=True):
             and EFFECTS[candidate.name].is_cause
             and walk.probability[key] >= LISTED_FROM
         ]
-        less.sort(key=lambda one: -one.probability)
+        less.sort(key=lambda entry: -entry.probability)
         return cls(
             tuple(round(chain.best.value, 2) for chain in walk.chains),
             len(walk.models),
@@ -436,8 +444,8 @@ def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[Floa
     for candidate, values in zip(group, parameters, strict=True):
         shift += data.columns([candidate]) @ values
     flat, base = shift.ravel(), data.base.reshape(3 * len(data), -1)
-    left = flat - base @ (base.T @ flat)
-    return float(np.sqrt(np.sum(left**2) / len(data)))
+    residual = flat - base @ (base.T @ flat)
+    return float(np.sqrt(np.sum(residual**2) / len(data)))
 
 
 def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:

@@ -114,26 +114,26 @@ def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, f
     for sensor, span in rows.spans:
         distance = data.part.range_m[span]
         low, high = np.quantile(distance, (0.25, 0.75))
-        near, far = length[span][distance <= low], length[span][distance >= high]
+        near_errors, far_errors = length[span][distance <= low], length[span][distance >= high]
         p_value = _p_value_ranks(distance, length[span]) if np.ptp(distance) > 0.0 else 1.0
         found[data.context.sensor_names[sensor]] = {
             'near_m': float(low),
             'far_m': float(high),
-            'far_over_near': float(np.sqrt(np.mean(far**2) / np.mean(near**2))),
+            'far_over_near': float(np.sqrt(np.mean(far_errors**2) / np.mean(near_errors**2))),
             'p_value': p_value,
         }
     return found
 
 
-def _p_value_ranks(some: FloatArray, others: FloatArray) -> float:
+def _p_value_ranks(x: FloatArray, y: FloatArray) -> float:
     """Return the p-value of a rank correlation (Spearman), two-sided; 1 for under 3 rows.
 
     By Student's t, as SciPy has it, whose statistics take 0.4 s to import.
     """
-    freedoms = len(some) - 2
+    freedoms = len(x) - 2
     if freedoms < 1:
         return 1.0
-    r = np.corrcoef(_ranks(some), _ranks(others))[0, 1]
+    r = np.corrcoef(_ranks(x), _ranks(y))[0, 1]
     return float(scipy.special.betainc(0.5 * freedoms, 0.5, 1.0 - min(1.0, r**2)))
 
 

@@ -92,7 +92,8 @@ class GeometryModel:
         nothing but offsets gains or loses by chance.
         """
         errors, drawn = (
-            np.linalg.norm(one[self.judged], axis=1) for one in (self.errors, self.drawing_errors)
+            np.linalg.norm(vectors[self.judged], axis=1)
+            for vectors in (self.errors, self.drawing_errors)
         )
         poses, of = np.unique(self.poses[self.judged], return_inverse=True)
         if len(poses) < FEWEST_POSES:
@@ -100,18 +101,20 @@ class GeometryModel:
         gains = np.bincount(of, drawn - errors) / np.bincount(of)
         return bool(gains.mean() > PLAINLY * gains.std(ddof=1) / np.sqrt(len(poses)))
 
-    def beside(self, alone: FitResult, gross: Sequence[int]) -> GeometryModel:
+    def beside(self, offsets_fit: FitResult, gross: Sequence[int]) -> GeometryModel:
         """Return this model judged against a fit of the zero-offsets that can be loaded instead.
 
         Parameters
         ----------
-        alone
+        offsets_fit
             Their fit.
         gross
             ``observation`` of the gross errors, which do not count.
         """
-        counts = ~np.isin(alone.measurements.observation, gross)
-        return replace(self, drawing_errors=alone.residuals_after, judged=self.judged & counts)
+        counts = ~np.isin(offsets_fit.measurements.observation, gross)
+        return replace(
+            self, drawing_errors=offsets_fit.residuals_after, judged=self.judged & counts
+        )
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
         """Return standard deviations of offsets, (k,), without the assumption of an exact drawing.
@@ -155,8 +158,8 @@ def geometry_model(found: Estimate, causes: Sequence[Candidate] = ()) -> Geometr
     drawing = _fitted(found, causes)
     found = _without_open_offsets(found)
     # What variances follow from: a fit of all rows follows.
-    some = of_spread_poses(found.problem.measurements, found.kept)
-    data = Residuals.of(found).only(some)
+    spread_rows = of_spread_poses(found.problem.measurements, found.kept)
+    data = Residuals.of(found).only(spread_rows)
     families = [
         family
         for members in (_lengths(data.context), _tilts(data.context))
@@ -168,9 +171,9 @@ def geometry_model(found: Estimate, causes: Sequence[Candidate] = ()) -> Geometr
         return None
     factors = dict(zip(solution.candidates, solution.smoothness, strict=True))
     std_m = np.concatenate(
-        [np.full(len(one.members), factors[one.candidate] ** -0.5) for one in families]
+        [np.full(len(kind.members), factors[kind.candidate] ** -0.5) for kind in families]
     )
-    members = tuple(member for one in families for member in one.members)
+    members = tuple(member for kind in families for member in kind.members)
     solution = by_members(solution, families)
     try:
         mode = estimate(found.problem, extension_of(data, solution, found)).mode
@@ -262,8 +265,8 @@ def _without_open_offsets(found: Estimate) -> Estimate:
     if not unknown:
         return found
     priors = found.problem.priors
-    held = replace(priors, joint_offsets={**unknown, **priors.joint_offsets})
-    return estimate(replace(found.problem, priors=held))
+    offset_priors = replace(priors, joint_offsets={**unknown, **priors.joint_offsets})
+    return estimate(replace(found.problem, priors=offset_priors))
 
 
 def _lengths(context: Context) -> list[Candidate]:
@@ -275,9 +278,9 @@ def _lengths(context: Context) -> list[Candidate]:
     }
     return [
         candidate
-        for own in per_link.values()
-        for candidate in own
-        if candidate.variant != 'along' or len(own) <= len('xyz')
+        for link_candidates in per_link.values()
+        for candidate in link_candidates
+        if candidate.variant != 'along' or len(link_candidates) <= len('xyz')
     ]
 
 
@@ -291,13 +294,13 @@ def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) 
     known = data.full_jacobian[data.rows.source][:, :, free]
     x = found.model.natural(found.mode.z)
     rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
-    both = np.concatenate((known, data.columns([one.candidate for one in families])), axis=2)
+    both = np.concatenate((known, data.columns([family.candidate for family in families])), axis=2)
     white = data.noise_model.whitened(both, data.noise).reshape(3 * len(data), -1)
     moved = np.zeros((found.model.size, white.shape[1] - len(free)))
     # The fit of the offsets to errors of that size.
-    own = white[:, : len(free)]
-    root = root_of_inverse(own.T @ own + rows.T @ rows)
-    moved[free] = root @ (root.T @ (own.T @ white[:, len(free) :]))
+    offset_columns = white[:, : len(free)]
+    root = root_of_inverse(offset_columns.T @ offset_columns + rows.T @ rows)
+    moved[free] = root @ (root.T @ (offset_columns.T @ white[:, len(free) :]))
     return moved[: found.model.joints]
 
 

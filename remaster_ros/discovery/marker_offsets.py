@@ -55,13 +55,13 @@ def moved_markers(
     effects = []
     for index, name in enumerate(problem.marker_names):
         where = model.marker(index)
-        others = np.delete(white, np.arange(where.start, where.stop), axis=1)
-        own = white[:, where]
-        own = own - _projected(others, own)
-        information = own.T @ own
+        other_columns = np.delete(white, np.arange(where.start, where.stop), axis=1)
+        marker_columns = white[:, where]
+        marker_columns = marker_columns - _projected(other_columns, marker_columns)
+        information = marker_columns.T @ marker_columns
         # Estimate of the data alone: the fitted place plus the step without the prior.
         moved = x[where] - problem.markers[index]
-        pull = own.T @ error + information @ moved
+        pull = marker_columns.T @ error + information @ moved
         values, axes = np.linalg.eigh(information)
         seen = values * std**2 > KNOWN_BETTER
         if not seen.any():
@@ -109,13 +109,13 @@ def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolAr
     return covariance
 
 
-def _projected(others: FloatArray, own: FloatArray) -> FloatArray:
-    """Return the projection of columns `own` on the span of `others`, which may be dependent."""
-    scale = np.linalg.norm(others, axis=0)
-    unit = others / np.where(scale > 0.0, scale, 1.0)
+def _projected(basis: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return the projection of `columns` on the span of `basis`, which may be dependent."""
+    scale = np.linalg.norm(basis, axis=0)
+    unit = basis / np.where(scale > 0.0, scale, 1.0)
     # By pivoted QR: the singular values would take three times as long.
     fit, *_ = scipy.linalg.lstsq(
-        unit, own, cond=ROUNDING, check_finite=False, lapack_driver='gelsy'
+        unit, columns, cond=ROUNDING, check_finite=False, lapack_driver='gelsy'
     )
     explained: FloatArray = unit @ fit
     return explained

@@ -110,14 +110,16 @@ class _Checks:
     def mispaired(self) -> BoolArray:
         """Gross rows that lie where the marker was at the configuration before or after, (n,)."""
         measurements = self.data.context.measurements
-        near = np.zeros(len(measurements), bool)
+        at_neighbour = np.zeros(len(measurements), bool)
         for rows in self._series():
-            for one, other in ((rows[1:], rows[:-1]), (rows[:-1], rows[1:])):
-                away = np.linalg.norm(measurements.position[one] - self.predicted[other], axis=1)
+            for index, other in ((rows[1:], rows[:-1]), (rows[:-1], rows[1:])):
+                distances = np.linalg.norm(
+                    measurements.position[index] - self.predicted[other], axis=1
+                )
                 # All configurations of a pose have the marker near one place.
-                apart = measurements.pose[one] != measurements.pose[other]
-                near[one] |= apart & (away < self.limit[one])
-        return near & self.gross
+                is_other_pose = measurements.pose[index] != measurements.pose[other]
+                at_neighbour[index] |= is_other_pose & (distances < self.limit[index])
+        return at_neighbour & self.gross
 
     def _series(self) -> Iterator[IntArray]:
         """Yield the rows of each sensor and marker, in the order of time."""
@@ -136,8 +138,8 @@ class _Checks:
         gross = np.flatnonzero(self.gross)
         # That a gross error ends by chance within the limit of one of two places: as often as it
         # lies within it of the places of other poses.
-        some = gross[:: 1 + len(gross) // MOST_COMPARED].tolist()
-        chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in some]))
+        sample = gross[:: 1 + len(gross) // MOST_COMPARED].tolist()
+        chance = min(1.0, 2.0 * np.mean([self._share_near(row) for row in sample]))
         p_value = float(scipy.special.bdtrc(count - 1, len(gross), chance))
         if p_value > SIGNIFICANCE:
             return
@@ -161,11 +163,13 @@ class _Checks:
         At least that of one pose.
         """
         measurements = self.data.context.measurements
-        others = (measurements.sensor == measurements.sensor[row]) & (
+        other_poses = (measurements.sensor == measurements.sensor[row]) & (
             measurements.pose != measurements.pose[row]
         )
-        away = np.linalg.norm(self.predicted[others] - measurements.position[row], axis=1)
-        return float((1 + np.sum(away < self.limit[row])) / (1 + len(away)))
+        distances = np.linalg.norm(
+            self.predicted[other_poses] - measurements.position[row], axis=1
+        )
+        return float((1 + np.sum(distances < self.limit[row])) / (1 + len(distances)))
 
     @cached_property
     def too_many(self) -> BoolArray:
@@ -341,7 +345,7 @@ def errors_by_place(
     white = data.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
     fitted = parts[0].shape[2] + parts[1].shape[2]
     model, errors, places = np.split(white, [fitted, fitted + 1], axis=2)
-    left = rows.group_sum(data.left(solution)) / rows.group_size[:, None]
+    pose_residuals = rows.group_sum(data.left(solution)) / rows.group_size[:, None]
     noise_m = data.noise_model.sensor_noise(solution.noise).total
     located = {
         candidate.subject for candidate in candidates if candidate.name == SENSOR_FIELD.name
@@ -354,7 +358,7 @@ def errors_by_place(
         found = explained_of_poses(rows, model, family, errors[:, :, 0])
         if found is None or found.p_value > significance:
             continue
-        mean_square = np.mean(np.sum(left[rows.group_sensor == sensor] ** 2, axis=1))
+        mean_square = np.mean(np.sum(pose_residuals[rows.group_sensor == sensor] ** 2, axis=1))
         size_m = float(np.sqrt(found.share * mean_square))
         yield Unexplained(
             where='sensor_frame',

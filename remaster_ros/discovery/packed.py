@@ -49,9 +49,9 @@ def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
     if np.array_equal(order, np.arange(len(order))):
         return matrices[:, : length(len(order))]
     i, j = _half(len(order))
-    one, other = order[i], order[j]
-    high = np.maximum(one, other)
-    chosen: FloatArray = np.take(matrices, high * (high + 1) // 2 + np.minimum(one, other), axis=1)
+    row, other = order[i], order[j]
+    high = np.maximum(row, other)
+    chosen: FloatArray = np.take(matrices, high * (high + 1) // 2 + np.minimum(row, other), axis=1)
     return chosen
 
 
@@ -60,8 +60,8 @@ def upper(matrix: FloatArray, size: int) -> FloatArray:
 
     What is below the diagonal is of no meaning.
     """
-    whole: FloatArray = dtpttr(size, matrix[: length(size)])[0]
-    return whole
+    square: FloatArray = dtpttr(size, matrix[: length(size)])[0]
+    return square
 
 
 def of_upper(matrix: FloatArray) -> FloatArray:

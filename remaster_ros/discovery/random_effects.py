@@ -96,7 +96,7 @@ class Family:
             largest.append((member.largest or np.inf) * of_a_height)
         if not seen:
             return None
-        count = sum(one.shape[1] for one in maps)
+        count = sum(mapping.shape[1] for mapping in maps)
         candidate = Candidate(
             name=name,
             place=seen[0].place,
@@ -123,14 +123,14 @@ def _lever(data: Residuals, members: Sequence[Candidate]) -> float:
 def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[FloatArray]) -> Design:
     """Columns of a family's members side by side, each weighted by its map."""
     parts = [
-        member.columns(context).displacement(context) @ one
-        for member, one in zip(members, maps, strict=True)
+        member.columns(context).displacement(context) @ mapping
+        for member, mapping in zip(members, maps, strict=True)
     ]
     return Design(None, np.concatenate(parts, axis=2))
 
 
 def kinds(
-    data: Residuals, candidates: Sequence[Candidate], apart: Sequence[Candidate] = ()
+    data: Residuals, candidates: Sequence[Candidate], singles: Sequence[Candidate] = ()
 ) -> list[Family]:
     """Return a family for each effect of some candidates, without members found by themselves.
 
@@ -138,8 +138,8 @@ def kinds(
     parameter in common the larger. What is drawn from thousands (orders of a gear, moments of a
     step, what has no name) is no family: with one variance each would be lost among the others.
     """
-    taken = {name for candidate in apart for name in candidate.parameters}
-    taken_places = {(candidate.name, candidate.joints, candidate.subject) for candidate in apart}
+    taken = {name for candidate in singles for name in candidate.parameters}
+    taken_places = {(candidate.name, candidate.joints, candidate.subject) for candidate in singles}
     members: dict[str, list[Candidate]] = {}
     for candidate in sorted(candidates, key=lambda candidate: -candidate.size):
         effect = EFFECTS[candidate.name]
@@ -191,8 +191,8 @@ def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
     p = len(solution.base)
 
     def covariances() -> tuple[FloatArray, FloatArray]:
-        whole = _diagonal([np.eye(p), together])
-        full = whole @ solution.full_covariance @ whole.T
+        full_map = _diagonal([np.eye(p), together])
+        full = full_map @ solution.full_covariance @ full_map.T
         return full, full
 
     return replace(

@@ -149,8 +149,8 @@ class Residuals:
 
     def less(self, shift: FloatArray) -> Residuals:
         """Return the residuals with displacements subtracted; ``shift``: m, (all rows, 3)."""
-        left = self.full_errors - shift
-        return replace(self, full_errors=left, errors=left[self.rows.source])
+        full_errors = self.full_errors - shift
+        return replace(self, full_errors=full_errors, errors=full_errors[self.rows.source])
 
     def only(self, source: IntArray) -> Residuals:
         """Return the residuals on other rows; ``source``: their indices among all rows."""
@@ -221,7 +221,7 @@ class Residuals:
         wanted = set(candidates)
         known, norms, grams = max(
             self._grams,
-            key=lambda one: sum(candidate.size for candidate in one[0] if candidate in wanted),
+            key=lambda entry: sum(candidate.size for candidate in entry[0] if candidate in wanted),
         )
         if not wanted <= set(known):
             part = [candidate for candidate in known if candidate in wanted]
@@ -262,8 +262,8 @@ class Residuals:
         grams[:, :done] = first
         for index, part in model.parts(lambda _, where: joined[where]):
             packed.add_products(grams[index], part, known)
-        for index, others in model.contained.items():
-            for other in others:
+        for index, contents in model.contained.items():
+            for other in contents:
                 grams[index, done:] -= grams[other, done:]
         # Fits are given parts of them.
         grams.setflags(write=False)
@@ -282,8 +282,8 @@ class Residuals:
 
     def unexplained(self, fit: Fit) -> FloatArray:
         """Return the residuals of a fit in every row of the session, m, (all rows, 3)."""
-        left: FloatArray = self.full_errors - self.full_base @ fit.base
-        return left - self.displaced(fit.candidates, fit.parameters)
+        residuals: FloatArray = self.full_errors - self.full_base @ fit.base
+        return residuals - self.displaced(fit.candidates, fit.parameters)
 
     def left(self, fit: Fit) -> FloatArray:
         """Return the residuals of a fit in the rows worked on, m, (n, 3)."""

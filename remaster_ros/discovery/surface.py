@@ -247,9 +247,9 @@ class Surface:
         known = values > ROUNDING * max(1.0, values[-1])
         rows = (vectors[:, known] * np.sqrt(values[known])).T
         Q = np.linalg.qr(np.concatenate((white[:, :p], rows)))[0]
-        rest = np.concatenate((white[:, p:], np.zeros((len(rows), white.shape[1] - p))))
-        rest -= Q @ (Q.T @ rest)
-        errors, absorbed = rest[:, 0], rest[:, 1:]
+        remainder = np.concatenate((white[:, p:], np.zeros((len(rows), white.shape[1] - p))))
+        remainder -= Q @ (Q.T @ remainder)
+        errors, absorbed = remainder[:, 0], remainder[:, 1:]
         square, turn = np.linalg.eigh(absorbed.T @ absorbed)
         seen = square > ROUNDING * max(1.0, square.max(initial=0.0))
         U = absorbed @ (turn[:, seen] / np.sqrt(square[seen]))
@@ -340,8 +340,8 @@ class Surface:
 
     def between(self, block: int, model: Sequence[tuple[int, int]]) -> FloatArray:
         """Return the products of the columns of a block with those of a model, (weights, q)."""
-        own = self.pool.of[block]
-        rows = [self.products(other)[:, own] for other, _ in model]
+        block_columns = self.pool.of[block]
+        rows = [self.products(other)[:, block_columns] for other, _ in model]
         return np.concatenate(rows).T.astype(float)
 
     def _turn(self, columns: Single, first: int) -> None:
@@ -355,16 +355,16 @@ class Surface:
         spans = [slice(i, i + ROWS) for i in range(0, len(columns), ROWS)]
         a, b, c = np.zeros((3, len(pairs)), np.float32)
         for span in spans:
-            one, other = columns[span, pairs], columns[span, pairs + 1]
-            a += np.einsum('ij,ij->j', one, one)
-            b += np.einsum('ij,ij->j', one, other)
+            column, other = columns[span, pairs], columns[span, pairs + 1]
+            a += np.einsum('ij,ij->j', column, column)
+            b += np.einsum('ij,ij->j', column, other)
             c += np.einsum('ij,ij->j', other, other)
         angle = 0.5 * np.arctan2(2.0 * b, a - c)
         cosine, sine = np.cos(angle), np.sin(angle)
         for span in spans:
-            one, other = columns[span, pairs], columns[span, pairs + 1]
-            columns[span, pairs] = cosine * one + sine * other
-            columns[span, pairs + 1] = cosine * other - sine * one
+            column, other = columns[span, pairs], columns[span, pairs + 1]
+            columns[span, pairs] = cosine * column + sine * other
+            columns[span, pairs + 1] = cosine * other - sine * column
         for i, size in zip(start[sizes > 2], sizes[sizes > 2], strict=True):
             mine = columns[:, i : i + size]
             columns[:, i : i + size] = mine @ np.linalg.eigh(mine.T @ mine)[1]
@@ -483,13 +483,16 @@ class State:
         which = np.array([block for block, _ in self.model], dtype=np.int64)
         levels = LEVELS_M[[level for _, level in self.model]]
         of_kind = np.bincount(pool.kind[which], minlength=1)
-        alone = of_kind[pool.kind[which]] == 1
-        lost = pool.log_prior[which] + np.where(alone, np.log(KIND_ODDS), 0.0)
+        is_single = of_kind[pool.kind[which]] == 1
+        lost = pool.log_prior[which] + np.where(is_single, np.log(KIND_ODDS), 0.0)
         sizes, first = pool.sizes[which], np.array([where.start for where in self.places])
         for size in np.unique(sizes).tolist():
             alike = np.flatnonzero(sizes == size)
-            own = first[alike][:, None] + np.arange(size)
-            covariance, mean = self.inverse[own[:, :, None], own[:, None, :]], self.weights[own]
+            indices = first[alike][:, None] + np.arange(size)
+            covariance, mean = (
+                self.inverse[indices[:, :, None], indices[:, None, :]],
+                self.weights[indices],
+            )
             determinant = np.linalg.slogdet(covariance / levels[alike, None, None] ** 2)[1]
             pulled = np.linalg.solve(covariance, mean[:, :, None])[:, :, 0]
             lost[alike] += 0.5 * (np.sum(mean * pulled, axis=1) + determinant)
@@ -498,18 +501,18 @@ class State:
     def with_block(self, block: int, level: int) -> State:
         """Return the model with a block more."""
         surface, pool = self.surface, self.surface.pool
-        own = pool.of[block]
-        between = self.regression_of(own).astype(float)
+        block_columns = pool.of[block]
+        between = self.regression_of(block_columns).astype(float)
         gram = surface.gram(block)
         if self.model:
             gram = gram - surface.between(block, self.model) @ between
-        gram = 0.5 * (gram + gram.T) + np.eye(len(own)) * LEVELS_M[level] ** -2.0
+        gram = 0.5 * (gram + gram.T) + np.eye(len(block_columns)) * LEVELS_M[level] ** -2.0
         middle = np.linalg.inv(gram)
-        pull = self.pull[own]
+        pull = self.pull[block_columns]
         mean = middle @ pull
         gain = 0.5 * (mean @ pull + np.linalg.slogdet(middle)[1])
         gain += self._prior(block, pool.kind[block] in self.kinds)
-        gain -= len(own) * np.log(LEVELS_M[level])
+        gain -= len(block_columns) * np.log(LEVELS_M[level])
         corner = -between @ middle
         if 'gains' in self.__dict__ and np.isfinite(self.gains[block, level]):
             self.gains[block, level] = gain

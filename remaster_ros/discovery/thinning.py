@@ -91,10 +91,10 @@ def judge_by_others(
     data: Residuals, rows: IntArray, searched: IntArray, empty: Solution, solution: Solution
 ) -> Thinning:
     """Hold the causes, frozen, against the rows that could have been searched, and were not."""
-    others = np.setdiff1d(rows, searched)
+    unsearched_rows = np.setdiff1d(rows, searched)
 
     def left(fit: Solution) -> float:
-        errors: FloatArray = data.unexplained(fit)[others]
+        errors: FloatArray = data.unexplained(fit)[unsearched_rows]
         return float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
 
     return Thinning(len(searched), len(rows), left(empty), left(solution))

@@ -46,8 +46,10 @@ class Unmodelled:
     def of(cls, found: Estimate, data: Residuals, solution: Solution) -> Unmodelled:
         """Assemble the normal equations of a solution, with its noise and its priors."""
         free, size = found.posterior.free, found.model.size
-        own = data.columns(solution.candidates)
-        columns = np.concatenate((data.full_jacobian[data.rows.source][:, :, free], own), axis=2)
+        effect_columns = data.columns(solution.candidates)
+        columns = np.concatenate(
+            (data.full_jacobian[data.rows.source][:, :, free], effect_columns), axis=2
+        )
         x = found.model.natural(found.mode.z)
         rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
         precision = np.zeros((columns.shape[2],) * 2)
@@ -55,7 +57,7 @@ class Unmodelled:
         precision[len(free) :, len(free) :] = solution.prior_precision()
         white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
         root = root_of_inverse(white.T @ white + precision)
-        where = np.concatenate((free, size + np.arange(own.shape[2])))
+        where = np.concatenate((free, size + np.arange(effect_columns.shape[2])))
         return cls(found, data, solution, white, root, where)
 
     @property
@@ -140,8 +142,8 @@ class Unmodelled:
         free = covariance[joints]
         taken = STEP_STD**-2.0 - OFFSET_STD**-2.0
         per_radian = found.problem.chain.per_radian[found.posterior.free[joints]]
-        held = np.linalg.inv(np.linalg.inv(free) + np.diag(taken / per_radian**2))
-        variance, less = np.diag(free), np.diag(free) - np.diag(held)
+        held_covariance = np.linalg.inv(np.linalg.inv(free) + np.diag(taken / per_radian**2))
+        variance, less = np.diag(free), np.diag(free) - np.diag(held_covariance)
         noticeable = less > NOTICEABLE * variance
         moves = np.zeros((self.size, int(noticeable.sum())))
         # All else goes along, so that the predictions stay.

@@ -121,11 +121,11 @@ def at_other_moments(
     between, changes = EFFECTS[candidate.name].between, EFFECTS[candidate.name].changes
     if candidate.changes is not None and changes is not None:
         found = [
-            one
+            variant
             for gap in gaps(context, low, high)
-            for one in changed_at(candidate.changes, changes, gap)
+            for variant in changed_at(candidate.changes, changes, gap)
         ]
-        return [one for one in found if one.ends == candidate.ends]
+        return [variant for variant in found if variant.ends == candidate.ends]
     if not candidate.happened or between is None:
         return []
     return [
@@ -167,11 +167,11 @@ class Evaluated:
     def std(self) -> dict[Candidate, float]:
         """Prior standard deviation of the weights of each kind of the background, m."""
         return {
-            one.candidate: (
-                self.factors[one.candidate.key] + (one.candidate.largest or np.inf) ** -2.0
+            family.candidate: (
+                self.factors[family.candidate.key] + (family.candidate.largest or np.inf) ** -2.0
             )
             ** -0.5
-            for one in self.families
+            for family in self.families
         }
 
     @cached_property
@@ -190,12 +190,12 @@ class Evaluated:
         Savage & Dickey: before the data, with their prior standard deviations, over after them.
         """
         mean, covariance = self.estimate
-        own, spread = mean[where], covariance[np.ix_(where, where)]
+        weights, spread = mean[where], covariance[np.ix_(where, where)]
         root, wrong = dpotrf(spread, lower=1)
         if wrong:
-            worth = own @ np.linalg.solve(spread, own) + np.linalg.slogdet(spread)[1]
+            worth = weights @ np.linalg.solve(spread, weights) + np.linalg.slogdet(spread)[1]
         else:
-            worth = np.sum(dtrtrs(root, own, lower=1)[0] ** 2)
+            worth = np.sum(dtrtrs(root, weights, lower=1)[0] ** 2)
             worth += 2.0 * np.sum(np.log(np.diag(root)))
         return float(0.5 * worth - np.sum(np.log(std)))
 
@@ -233,7 +233,7 @@ class Evaluated:
         """
         found = {}
         for family in self.families:
-            mine = [one for one in self.members if one[0] is family]
+            mine = [entry for entry in self.members if entry[0] is family]
             causes: dict[Identity, list[tuple[Candidate, IntArray]]] = {}
             for _, member, where, _ in mine:
                 causes.setdefault(identity(member), []).append((member, where))
@@ -307,9 +307,9 @@ def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
             continue
         for member in family.members:
             name = ' '.join(map(str, member.key))
-            one = Family.of(data, name, [member], alike=family.members)
-            assert one is not None
-            found.append(replace(one, candidate=replace(one.candidate, variant=ALONE)))
+            form = Family.of(data, name, [member], alike=family.members)
+            assert form is not None
+            found.append(replace(form, candidate=replace(form.candidate, variant=ALONE)))
     return found
 
 
@@ -319,9 +319,11 @@ def log_price(families: Sequence[Family]) -> float:
     A kind pays what the first block of a kind does, and a free form with a variance of its own
     what a block pays.
     """
-    forms = [one.members[0] for one in families if one.candidate.variant == ALONE]
+    forms = [family.members[0] for family in families if family.candidate.variant == ALONE]
     each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
-    paid = {one.members[0].name for one in families if one.members[0].model_change is None}
+    paid = {
+        family.members[0].name for family in families if family.members[0].model_change is None
+    }
     return float(each + len(paid) * np.log(KIND_ODDS))
 
 
@@ -361,7 +363,7 @@ class Walk:
         changes = [] if _has_few_poses(data) else changes
         candidates = [candidate for candidate in candidates if candidate.changes is None]
         self._changing = [*{c.changes.key: c.changes for c in changes if c.changes}.values()]
-        of_background = {member.key for one in self.families for member in one.members}
+        of_background = {member.key for entry in self.families for member in entry.members}
         singles = [
             candidate
             for candidate in candidates
@@ -372,10 +374,12 @@ class Walk:
         for candidate, _ in () if start is None else start.blocks:
             # Rows that were not worked on before may tell of another moment.
             reach = DATED_TO * float(np.ptp(data.context.elapsed_s))
-            others = at_other_moments(
+            variants = at_other_moments(
                 candidate, data.part, candidate.moment - reach, candidate.moment + reach
             )
-            dated |= {one.key: one for one in (candidate, *others) if one.key not in tried}
+            dated |= {
+                entry.key: entry for entry in (candidate, *variants) if entry.key not in tried
+            }
         self.pool = Pool(data, blocks_of(data, [*singles, *dated.values()]))
         self._last_surface: Surface | None = None
         self._known: dict[Model, Evaluated | None] = {}
@@ -403,7 +407,7 @@ class Walk:
             self.chains.append(self._chain(better, hot=False))
         changed = self._with_changes(changes) if start is None else []
         if self._refined() or changed:
-            first = max([self._best_found, *changed], key=lambda one: one.value)
+            first = max([self._best_found, *changed], key=lambda entry: entry.value)
             self.chains.append(self._chain(first, hot=False))
         if changed and self._refined():
             self.chains.append(self._chain(self._best_found, hot=False))
@@ -414,7 +418,7 @@ class Walk:
     @property
     def _best_found(self) -> Evaluated:
         """Best model of all chains so far."""
-        return max((chain.best for chain in self.chains), key=lambda one: one.value)
+        return max((chain.best for chain in self.chains), key=lambda model: model.value)
 
     def _form_for_shapes(self) -> Evaluated | None:
         """Return a model better than all so far, with a free form in place of its shapes.
@@ -434,7 +438,7 @@ class Walk:
             }
             if not shapes or form in start.families:
                 continue
-            model = tuple(one for one in start.model if one[0] not in shapes)
+            model = tuple(entry for entry in start.model if entry[0] not in shapes)
             found = evaluated(self.pool, [*start.families, form], model, start)
             if found is not None and found.value > best.value:
                 best = found
@@ -451,17 +455,17 @@ class Walk:
             state = State.of(self._surface(best.noise, best.std), best.model)
             weakest = np.argsort(state.losses)[:WEAKEST].tolist()
             gain, model = 0.0, best.model
-            for one, other in itertools.combinations(sorted(weakest, reverse=True), 2):
-                rest = state.without(one).without(other)
-                for block, level in self._likeliest(rest):
-                    more = rest.with_block(block, level)
+            for entry, other in itertools.combinations(sorted(weakest, reverse=True), 2):
+                reduced_state = state.without(entry).without(other)
+                for block, level in self._likeliest(reduced_state):
+                    more = reduced_state.with_block(block, level)
                     index = np.unravel_index(np.argmax(more.gains), more.gains.shape)
                     value = more.value + more.gains[index] - state.value
                     if value > gain + SETTLED:
                         gain, model = value, more.with_block(int(index[0]), int(index[1])).key
             if model != best.model:
                 found.append(self._refitted(model, best, new_background=True))
-        better = max(found, key=lambda one: one.value, default=None)
+        better = max(found, key=lambda entry: entry.value, default=None)
         if better is None or better.value < self._best_found.value + SETTLED:
             return None
         return better
@@ -488,9 +492,11 @@ class Walk:
             mine = [self.pool.blocks[block] for block, _ in best.model]
             levels = tuple((i, level) for i, (_, level) in enumerate(best.model))
             pool = Pool(self.data, [*mine, *blocks])
-            steady = [one for one in best.families if one.members[0].name != SENSOR_WANDER.name]
+            steady = [
+                entry for entry in best.families if entry.members[0].name != SENSOR_WANDER.name
+            ]
             for families in [best.families, steady][: 1 + (len(steady) < len(best.families))]:
-                std = {one.candidate: best.std[one.candidate] for one in families}
+                std = {entry.candidate: best.std[entry.candidate] for entry in families}
                 state = State.of(Surface(pool, best.noise, std), levels)
                 gains = state.gains[len(mine) :]
                 gain = gains.max(axis=1)
@@ -500,7 +506,7 @@ class Walk:
                     gain = np.maximum(gain, there)
                 likely = [blocks[i] for i in np.flatnonzero(gain > -NEEDED).tolist()]
                 self.pool.extend(
-                    [one for one in likely if one.candidate.key not in self.pool.place]
+                    [entry for entry in likely if entry.candidate.key not in self.pool.place]
                 )
                 if not likely:
                     continue
@@ -508,8 +514,8 @@ class Walk:
                 added = self.pool.place.get(blocks[index].candidate.key)
                 if added is not None:
                     model = tuple(sorted((*best.model, (added, int(level)))))
-                    one = evaluated(self.pool, families, model, best)
-                    found += [] if one is None else [one]
+                    entry = evaluated(self.pool, families, model, best)
+                    found += [] if entry is None else [entry]
         return found
 
     def _refined(self) -> bool:
@@ -526,12 +532,14 @@ class Walk:
             if not candidate.happened:
                 finer = EFFECTS[candidate.name].finer
                 nearby = [] if finer is None else [*finer(context, candidate)]
-                waiting |= {one.key: one for one in nearby if one.key not in self.pool.place}
+                waiting |= {
+                    entry.key: entry for entry in nearby if entry.key not in self.pool.place
+                }
                 continue
             added = added or bool(waiting)
             self.pool.extend(blocks_of(self.data, [*waiting.values()]))
             waiting = {}
-            moments = np.unique([one.moment for one in tried if one.name == candidate.name])
+            moments = np.unique([entry.moment for entry in tried if entry.name == candidate.name])
             low = np.max(moments[moments < candidate.moment], initial=-np.inf)
             high = np.min(moments[moments > candidate.moment], initial=np.inf)
             nearby = [
@@ -542,41 +550,43 @@ class Walk:
             first = len(self.pool.blocks)
             self.pool.extend(blocks_of(self.data, nearby))
             surface = self._surface(best.noise, best.std)
-            rest = State.of(surface, best.model[:position] + best.model[position + 1 :])
-            near = [block, *range(first, len(self.pool.blocks))]
-            spread = self._spread_of_moments(rest, candidate)
-            for i in near:
-                one = self.pool.blocks[i]
+            reduced_state = State.of(surface, best.model[:position] + best.model[position + 1 :])
+            alternatives = [block, *range(first, len(self.pool.blocks))]
+            spread = self._spread_of_moments(reduced_state, candidate)
+            for i in alternatives:
+                entry = self.pool.blocks[i]
                 self.pool.blocks[i] = replace(
-                    one, candidate=replace(one.candidate, moment_std=spread)
+                    entry, candidate=replace(entry.candidate, moment_std=spread)
                 )
             self._known.clear()
             self._wholes.clear()
-            added = added or len(near) > 1
+            added = added or len(alternatives) > 1
         added = added or bool(waiting)
         self.pool.extend(blocks_of(self.data, [*waiting.values()]))
         happened = [
-            one for block, _ in best.model if (one := self.pool.blocks[block].candidate).happened
+            entry
+            for block, _ in best.model
+            if (entry := self.pool.blocks[block].candidate).happened
         ]
         near_these = {
-            one.key: one
+            entry.key: entry
             for candidate in happened
-            for one in self._changes_near(candidate.moment)
-            if one.key not in self.pool.place
+            for entry in self._changes_near(candidate.moment)
+            if entry.key not in self.pool.place
         }
         self.pool.extend(blocks_of(self.data, [*near_these.values()]))
         return added or bool(near_these)
 
-    def _spread_of_moments(self, rest: State, candidate: Candidate) -> float:
+    def _spread_of_moments(self, state: State, candidate: Candidate) -> float:
         """Return the standard deviation of the moment of a cause beside a model, s.
 
         Over all moments that were tried, each for the time that is nearest to it.
         """
         same = [
-            (one.candidate.moment, rest.gains[index].max())
-            for index, one in enumerate(self.pool.blocks)
-            if identity(one.candidate) == identity(candidate)
-            and one.candidate.variant == candidate.variant
+            (block.candidate.moment, state.gains[index].max())
+            for index, block in enumerate(self.pool.blocks)
+            if identity(block.candidate) == identity(candidate)
+            and block.candidate.variant == candidate.variant
         ]
         at, gain = np.array(sorted(same)).T
         weight = np.exp(gain - gain.max())
@@ -595,11 +605,11 @@ class Walk:
         found = gaps(context)
         nearest = found[np.argsort(np.abs(found.mean(axis=1) - moment))[:NEAREST]]
         return [
-            one
+            change
             for candidate in self._changing
             if (changes := EFFECTS[candidate.name].changes) is not None
             for gap in nearest
-            for one in changed_at(candidate, changes, gap)
+            for change in changed_at(candidate, changes, gap)
         ]
 
     def _again(self, start: Evaluated) -> Evaluated:
@@ -694,7 +704,7 @@ class Walk:
                 for families in (self.families, self.by_form)
                 if (found := evaluated(self.pool, families, model, start)) is not None
             ]
-            self._wholes[model] = max(tried, key=lambda one: one.value, default=None)
+            self._wholes[model] = max(tried, key=lambda result: result.value, default=None)
         return self._wholes[model]
 
     def _refitted(self, model: Model, before: Evaluated, new_background: bool) -> Evaluated:
@@ -732,9 +742,9 @@ class Walk:
                 continue
             moved = self.data.columns([member]) @ (mapping @ found.estimate[0][where])
             size = np.sqrt(np.sum(moved**2) / len(self.data))
-            away = np.abs(np.log(LEVELS_M / max(size, NOTHING)))
-            away = np.where(self.pool.allowed[block], away, np.inf)
-            more.append((block, int(np.argmin(away))))
+            distance = np.abs(np.log(LEVELS_M / max(size, NOTHING)))
+            distance = np.where(self.pool.allowed[block], distance, np.inf)
+            more.append((block, int(np.argmin(distance))))
         return self.evaluate(tuple(sorted({*found.model, *more})), found) if more else None
 
     def _weigh(self) -> None:
@@ -749,19 +759,23 @@ class Walk:
                 # With its own background; candidates may have been dated since.
                 again = evaluated(self.pool, chain.best.families, chain.best.model, chain.best)
                 self._known[chain.best.model] = again
-        pooled |= {model: one.value for model, one in self._known.items() if one is not None}
+        pooled |= {
+            model: evaluation.value
+            for model, evaluation in self._known.items()
+            if evaluation is not None
+        }
         start = self._best_found
         for model, value in self._exchanges(start).items():
             pooled[model] = max(value, pooled.get(model, -np.inf))
         order = sorted(pooled, key=lambda model: -pooled[model])[:MOST_MODELS]
         models = [
-            one
+            evaluation
             for model in order
             if pooled[model] > start.value - NEGLIGIBLE
-            and (one := self.evaluate(model, start)) is not None
+            and (evaluation := self.evaluate(model, start)) is not None
         ]
-        models.sort(key=lambda one: -one.value)
-        values = np.array([one.value for one in models])
+        models.sort(key=lambda evaluation: -evaluation.value)
+        values = np.array([evaluation.value for evaluation in models])
         share = np.exp(values - logsumexp(values))
         count = int(np.sum(share > LEAST_SHARE))
         self.models = models[:count]
@@ -775,24 +789,24 @@ class Walk:
         best model leaves, and what wanders with the sensor. 1 where r may be chance.
         """
         data, best, m = self.data, self.best, self.data.part.measurements
-        left = data.left(best)
+        residuals = data.left(best)
         for candidate, where in zip(best.candidates, best.slices(), strict=True):
             if candidate.name == SENSOR_WANDER.name:
-                left = left + data.columns([candidate]) @ best.parameters[where]
+                residuals = residuals + data.columns([candidate]) @ best.parameters[where]
         order = np.lexsort((data.part.elapsed_s, data.part.marker, data.part.sensor))
-        one, other = order[:-1], order[1:]
+        rows, other = order[:-1], order[1:]
         follows = (
-            (data.part.sensor[one] == data.part.sensor[other])
-            & (data.part.marker[one] == data.part.marker[other])
+            (data.part.sensor[rows] == data.part.sensor[other])
+            & (data.part.marker[rows] == data.part.marker[other])
             # Errors of one pose have a part in common all the same.
-            & (m.pose[one] != m.pose[other])
+            & (m.pose[rows] != m.pose[other])
         )
-        one, other = one[follows], other[follows]
-        squares = np.sum(left[one] ** 2) * np.sum(left[other] ** 2)
+        rows, other = rows[follows], other[follows]
+        squares = np.sum(residuals[rows] ** 2) * np.sum(residuals[other] ** 2)
         if not squares:
             return 1.0
-        r = float(np.sum(left[one] * left[other]) / np.sqrt(squares))
-        return 1.0 if r < 2.0 / np.sqrt(3.0 * len(one)) else (1.0 - r) / (1.0 + r)
+        r = float(np.sum(residuals[rows] * residuals[other]) / np.sqrt(squares))
+        return 1.0 if r < 2.0 / np.sqrt(3.0 * len(rows)) else (1.0 - r) / (1.0 + r)
 
     def log_gain(self, causes: Sequence[Candidate], share: float = 1.0) -> float:
         """Return the loss in log posterior of the best model by leaving out some causes of it.
@@ -802,12 +816,12 @@ class Walk:
         best, mine = self.models[0], {identity(candidate) for candidate in causes}
         wheres, stds, price = [], [], 0.0
         for block, level in best.model:
-            one = self.pool.blocks[block]
-            if identity(one.candidate) in mine:
-                part = best.where[one.weights(level)]
+            pool_block = self.pool.blocks[block]
+            if identity(pool_block.candidate) in mine:
+                part = best.where[pool_block.weights(level)]
                 wheres.append(np.arange(part.start, part.stop))
-                stds.append(np.full(one.size, LEVELS_M[level]))
-                price += one.log_prior
+                stds.append(np.full(pool_block.size, LEVELS_M[level]))
+                price += pool_block.log_prior
         for family, member, where, _ in best.members:
             if identity(member) in mine:
                 wheres.append(where)
@@ -818,8 +832,8 @@ class Walk:
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
         """All models as solutions in their candidates' parameters, each with its share."""
-        others = [self.solution(one) for one in self.models[1:]]
-        return [*zip([self.best, *others], self.share.tolist(), strict=True)]
+        other_solutions = [self.solution(model) for model in self.models[1:]]
+        return [*zip([self.best, *other_solutions], self.share.tolist(), strict=True)]
 
     @cached_property
     def best(self) -> Solution:
@@ -834,11 +848,16 @@ class Walk:
         found: dict[Model, float] = {}
         state = State.of(self._surface(best.noise, best.std), best.model)
         for position in range(len(best.model)):
-            rest = state.without(position)
-            order = np.argsort(-rest.gains, axis=None)[:MOST_EXCHANGED]
-            for block, level in zip(*np.unravel_index(order, rest.gains.shape), strict=True):
-                if rest.value + rest.gains[block, level] > state.value - NEGLIGIBLE:
-                    other = rest.with_block(int(block), int(level))
+            reduced_state = state.without(position)
+            order = np.argsort(-reduced_state.gains, axis=None)[:MOST_EXCHANGED]
+            for block, level in zip(
+                *np.unravel_index(order, reduced_state.gains.shape), strict=True
+            ):
+                if (
+                    reduced_state.value + reduced_state.gains[block, level]
+                    > state.value - NEGLIGIBLE
+                ):
+                    other = reduced_state.with_block(int(block), int(level))
                     found[other.key] = best.value + other.value - state.value
         return found
 
@@ -863,16 +882,16 @@ class Walk:
                 # The same cause by another axis or direction, which the background has.
                 continue
             if candidate in best.standing_out and best.by_itself[candidate] < 0.0:
-                mine = [one for one in named if identity(one) == identity(candidate)]
-                if candidate is not max(mine, key=lambda one: best.by_itself.get(one, np.inf)):
+                mine = [cause for cause in named if identity(cause) == identity(candidate)]
+                if candidate is not max(mine, key=lambda cause: best.by_itself.get(cause, np.inf)):
                     continue
             chance = self.probability_of(candidate)
             if chance >= 0.5 or chance + sum(self.instead_of([candidate]).values()) >= 0.5:
                 # A member may be a part of a block.
                 found += [
-                    one
-                    for one in self.best.candidates
-                    if one not in found and {*one.parameters}.issuperset(candidate.parameters)
+                    cause
+                    for cause in self.best.candidates
+                    if cause not in found and {*cause.parameters}.issuperset(candidate.parameters)
                 ]
         return found
 
@@ -881,10 +900,11 @@ class Walk:
         if not (EFFECTS[candidate.name].many and candidate.is_shape_of(form)):
             return False
         both = [
-            self.data.columns([one]).reshape(3 * len(self.data), -1) for one in (candidate, form)
+            self.data.columns([cause]).reshape(3 * len(self.data), -1)
+            for cause in (candidate, form)
         ]
-        rest = both[0] - both[1] @ np.linalg.lstsq(both[1], both[0], rcond=None)[0]
-        return bool(np.sum(rest**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
+        residual = both[0] - both[1] @ np.linalg.lstsq(both[1], both[0], rcond=None)[0]
+        return bool(np.sum(residual**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
 
     def instead_of(self, group: Sequence[Candidate]) -> dict[Candidate, float]:
         """Return the candidates that models have in place of some causes, with probabilities.
@@ -942,9 +962,9 @@ class Walk:
         mean, covariance = model.estimate
         parts: list[tuple[Candidate, slice, FloatArray, FloatArray, float]] = []
         for block, level in model.model:
-            one = self.pool.blocks[block]
-            where = model.where[one.weights(level)]
-            parts.append((one.candidate, where, one.map, one.scale, LEVELS_M[level] ** -2.0))
+            entry = self.pool.blocks[block]
+            where = model.where[entry.weights(level)]
+            parts.append((entry.candidate, where, entry.map, entry.scale, LEVELS_M[level] ** -2.0))
         scales = {
             member: scale
             for family in model.families
@@ -960,7 +980,7 @@ class Walk:
         having: dict[str, list[Candidate]] = {}
         for candidate, *_ in sorted(parts, key=lambda part: -part[0].size):
             larger = having.get(candidate.parameters[0], [])
-            if not any(set(one.parameters).issuperset(candidate.parameters) for one in larger):
+            if not any(set(entry.parameters).issuperset(candidate.parameters) for entry in larger):
                 candidates.append(candidate)
                 for name in candidate.parameters:
                     having.setdefault(name, []).append(candidate)

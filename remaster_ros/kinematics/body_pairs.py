@@ -165,14 +165,16 @@ class BodyPairs:
         low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
         q = low + np.random.default_rng(0).random((_SAMPLES, len(self.chain))) * (high - low)
-        touching, near = np.zeros(len(self.inner)), np.zeros(len(self.inner))
+        touching, near_count = np.zeros(len(self.inner)), np.zeros(len(self.inner))
         # With the planner's reserve, so that it does not reject all configurations of such a pair.
         for short in self.examine(self.place(q), RESERVE_M)[0]:
-            near[short.pair] += 1
+            near_count[short.pair] += 1
             touching[short.pair] += short.distance < 0.0
-        is_self = np.array([self.category(pair) == SELF_COLLISION for pair in range(len(near))])
+        is_self = np.array(
+            [self.category(pair) == SELF_COLLISION for pair in range(len(near_count))]
+        )
         share = np.where(is_self, _MOST, 1.0) * _SAMPLES
-        out, contact_only = touching >= share, near >= share
+        out, contact_only = touching >= share, near_count >= share
         for pair in np.flatnonzero(out | contact_only):
             inner, outer = self.names(int(pair))
             how = 'overlap by construction, not checked' if out[pair] else 'checked for contact'
@@ -321,11 +323,11 @@ class BodyPairs:
         if not len(rows):
             return rows, pairs, np.empty(0), np.empty(0, dtype=bool)
         kept = self.kept(placed, rows, pairs) + on_top[pairs]
-        near = bounds[rows, pairs] < kept
-        rows, pairs, kept = rows[near], pairs[near], kept[near]
+        is_short = bounds[rows, pairs] < kept
+        rows, pairs, kept = rows[is_short], pairs[is_short], kept[is_short]
         decided = self.measure_cheap(placed, rows, pairs, bounds)
-        near = bounds[rows, pairs] < kept
-        return rows[near], pairs[near], kept[near], decided[near]
+        is_short = bounds[rows, pairs] < kept
+        return rows[is_short], pairs[is_short], kept[is_short], decided[is_short]
 
     def examine(
         self, placed: Placed, extra: float, *, first: bool = False, one: bool = False

@@ -167,10 +167,10 @@ class _ExactArm:
         off_m = np.linalg.norm(position - T[:3, 3], axis=1)
         # The Frobenius norm of a difference of rotations is 2 sqrt(2) sin(angle / 2).
         off_rad = np.linalg.norm(rotation - T[:3, :3], axis=(1, 2)) / np.sqrt(2.0)
-        near = 2.0 * PERTURBATION
+        factor = 2.0 * PERTURBATION
         q = q[
-            (off_m <= near * self.difference_m + EXACT)
-            & (off_rad <= near * self.difference_rad + EXACT)
+            (off_m <= factor * self.difference_m + EXACT)
+            & (off_rad <= factor * self.difference_rad + EXACT)
         ]
         gaps = np.max(np.abs(wrapped(q[:, None] - q[None])), axis=-1)
         return q[~np.any(np.tril(gaps < ONE_START_RAD, -1), axis=1)]
@@ -347,15 +347,15 @@ class InverseKinematics:
         if _is_mobile(chain, {joint: values[0] for joint, values in self.held.items()}):
             return
         names = ', '.join(chain.joint_names[joint] for joint in self.held)
-        others = [
+        other_joints = [
             f'{name} (at {chain.shown_offset(joint, value, 0)}, say)'
             for joint, name in enumerate(chain.joint_names)
             for value in (_middle(chain, joint),)
             if len(self.held) == 1 and _is_mobile(chain, {joint: value})
         ]
         remedy = (
-            f'held_joint in the cell file may be {" or ".join(others)}'
-            if others
+            f'held_joint in the cell file may be {" or ".join(other_joints)}'
+            if other_joints
             else OWN_CONFIGURATIONS
         )
         raise InputError(
@@ -420,31 +420,32 @@ class InverseKinematics:
         return q + 2 * np.pi * turns
 
 
-def _is_mobile(chain: SerialChain, held: Mapping[int, float]) -> bool:
+def _is_mobile(chain: SerialChain, held_values: Mapping[int, float]) -> bool:
     """Whether the Jacobian of the free joints has full rank at one of 8 fixed configurations.
 
-    Full: its smallest singular value is `IMMOBILE` or more. ``held``: index from 0 -> rad or m.
+    Full: its smallest singular value is `IMMOBILE` or more. ``held_values``: index from 0 -> rad
+    or m.
     """
     spread = np.sin(np.arange(8.0 * len(chain))).reshape(8, -1)
-    spread[:, list(held)] = list(held.values())
-    free = [i for i in range(len(chain)) if i not in held]
+    spread[:, list(held_values)] = list(held_values.values())
+    free = [i for i in range(len(chain)) if i not in held_values]
     screws = screws_and_tool(chain, spread)[0][..., free]
     return bool(np.max(np.linalg.svd(screws, compute_uv=False)[:, -1]) >= IMMOBILE)
 
 
-def _check_held(chain: SerialChain, held: Mapping[int, Sequence[float]]) -> None:
+def _check_held(chain: SerialChain, held_values: Mapping[int, Sequence[float]]) -> None:
     """Raise InputError if the number of free joints or a held value is not supported.
 
     Free are six, or all of three to five joints; values have to be within the limits.
     """
-    free = len(chain) - len(held)
+    free = len(chain) - len(held_values)
     if free != min(len(chain), FREE_JOINTS) or free < FEWEST_JOINTS:
         raise InputError(
-            f'inverse kinematics: {len(chain)} joints with {len(held)} held leave {free} free; '
-            f'poses need {FREE_JOINTS} free joints, or all of {FEWEST_JOINTS} to '
+            f'inverse kinematics: {len(chain)} joints with {len(held_values)} held leave {free} '
+            f'free; poses need {FREE_JOINTS} free joints, or all of {FEWEST_JOINTS} to '
             f'{FREE_JOINTS - 1}: hold none of six or fewer, one of seven'
         )
-    for joint, values in held.items():
+    for joint, values in held_values.items():
         if not 0 <= joint < len(chain):
             raise InputError(
                 f'inverse kinematics: held joint index {joint} is not in 0 to {len(chain) - 1}'

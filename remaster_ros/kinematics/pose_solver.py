@@ -169,12 +169,12 @@ def distinct(chain: SerialChain, q: FloatArray) -> tuple[FloatArray, IntArray]:
     """
     gaps = q[:, None] - q[None]
     gaps = np.abs(np.where(chain.slides, gaps, wrapped(gaps)))
-    one = np.all(gaps <= DISTINCT * chain.per_radian, axis=-1)
+    is_same = np.all(gaps <= DISTINCT * chain.per_radian, axis=-1)
     kept: list[int] = []
     for i in range(len(q)):
-        if not one[i, kept].any():
+        if not is_same[i, kept].any():
             kept.append(i)
-    return q[kept], np.sum(one[kept], axis=1)
+    return q[kept], np.sum(is_same[kept], axis=1)
 
 
 def spread(chain: SerialChain, free: Sequence[int], count: int) -> FloatArray:

@@ -627,14 +627,14 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
         )
     elif found is not None and not rows:
         # Causes have answered the findings of the fit without them.
-        left = more_than_noise(found)
-        if not left and not found.effects:
-            left = next(iter(judgement.findings), '')
-        if left:
+        finding = more_than_noise(found)
+        if not finding and not found.effects:
+            finding = next(iter(judgement.findings), '')
+        if finding:
             rows.append(
                 Remaining(
-                    NOISE_UNKNOWN if FEW_HELD_OUT in left else 'More than noise',
-                    f'{left.rstrip(".")}. No cause that was tried explains it',
+                    NOISE_UNKNOWN if FEW_HELD_OUT in finding else 'More than noise',
+                    f'{finding.rstrip(".")}. No cause that was tried explains it',
                     'Look at the largest errors below; measure again, with references in between.',
                 )
             )
@@ -681,8 +681,8 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
         rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))
     if isinstance(found.unexplained, list):
         rows += [
-            Remaining('Unexplained', f'{1e3 * left.size_m:.3f} mm RMS', left.next)
-            for left in found.unexplained
+            Remaining('Unexplained', f'{1e3 * error.size_m:.3f} mm RMS', error.next)
+            for error in found.unexplained
         ]
     return rows
 

@@ -46,7 +46,7 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for row in rows:
         counts[row['status']] += 1
         if row['status'] == 'done':
-            names = tuple(one['joint'] for one in row['fit']['joints'])
+            names = tuple(joint['joint'] for joint in row['fit']['joints'])
             arms[row['fit']['robot'], names].append(row)
     joints = [
         _joint(robot, name, index, selection, FALSE / len(names))
@@ -54,16 +54,16 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         for index, name in enumerate(names)
     ]
     lines = [', '.join(f'{count} {status}' for status, count in counts.items())]
-    for one in joints:
-        if one['differs']:
+    for joint in joints:
+        if joint['differs']:
             lines.append(
-                f'{one["robot"]}, {one["joint"]}: {", ".join(one["differs"])} differ from the '
-                f'median {_shown(one, "median")}'
+                f'{joint["robot"]}, {joint["joint"]}: {", ".join(joint["differs"])} differ from '
+                f'the median {_shown(joint, "median")}'
             )
-        if one['since']:
+        if joint['since']:
             lines.append(
-                f'{one["robot"]}, {one["joint"]}: changed by {_shown(one, "change")} along '
-                f'the sessions, since {one["since"]}'
+                f'{joint["robot"]}, {joint["joint"]}: changed by {_shown(joint, "change")} along '
+                f'the sessions, since {joint["since"]}'
             )
     for row in rows:
         check = row.get('check', {})
@@ -98,9 +98,9 @@ def differing(values: FloatArray, level: float) -> list[int]:
     return sorted(removed[:differ])
 
 
-def _shown(one: Mapping[str, Any], key: str) -> str:
+def _shown(joint: Mapping[str, Any], key: str) -> str:
     """Value of a joint with sign and unit, four decimals; ``key`` as in 'median', without unit."""
-    return f'{one[key + "_" + one["unit"]]:+.4f} {one["unit"]}'
+    return f'{joint[key + "_" + joint["unit"]]:+.4f} {joint["unit"]}'
 
 
 def _joint(

@@ -59,19 +59,19 @@ def _draw(trend: Trend) -> Figure:
     from remaster_ros.reports.figures import AFTER, BEFORE, WIDTH_IN
 
     content, x_m, names = trend
-    shown = [i for i, one in enumerate(content['joints']) if one['detectable_mm'] is not None]
+    shown = [i for i, joint in enumerate(content['joints']) if joint['detectable_mm'] is not None]
     figure = Figure(figsize=(WIDTH_IN, 1.25 * len(shown) + 0.4), layout='constrained')
     axes = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     numbers = np.arange(1, len(names) + 1)
     for ax, i in zip(axes, shown, strict=True):
-        one = content['joints'][i]
-        is_it = one['joint'] in content['changed']
+        joint = content['joints'][i]
+        is_it = joint['joint'] in content['changed']
         values = 1e3 * x_m[:, i]
         ax.axhspan(-content['smallest_mm'], content['smallest_mm'], color=AFTER, alpha=0.12, lw=0)
         ax.plot(numbers, values, 'o-', color=BEFORE if is_it else AFTER, ms=3.0, lw=0.8)
         if content['since_check'] is not None:
             ax.axvline(content['since_check'] - 0.5, color=BEFORE, lw=0.9, ls='--')
-        ax.set_title(one['joint'] + (': changed' if is_it else ''))
+        ax.set_title(joint['joint'] + (': changed' if is_it else ''))
         ax.set_ylabel('mm')
         ax.margins(x=0.02)
     axes[-1].xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -598,8 +598,8 @@ def drivers(discovery: Discovery) -> Figure:
     if discovery.groups:
         fits.append((discovery.solution, AFTER, 'after'))
     for fit, color, _ in fits:
-        left = data.left(fit)
-        along = 1e3 * np.einsum('nij,ni->nj', motion, left) / length
+        residuals = data.left(fit)
+        along = 1e3 * np.einsum('nij,ni->nj', motion, residuals) / length
         for row, (_, value) in enumerate(kept):
             for joint in range(joints):
                 _binned(axes[row, joint], value(joint), along[:, joint], color)
@@ -693,7 +693,7 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
 def _estimate(discovery: Discovery, candidate: Candidate) -> FloatArray:
     """Parameters (p,) of a cause in the whole model, perhaps those of a larger candidate."""
     solution = discovery.solution
-    names = [name for one in solution.candidates for name in one.parameters]
+    names = [name for member in solution.candidates for name in member.parameters]
     return solution.parameters[[names.index(name) for name in candidate.parameters]]
 
 
@@ -752,15 +752,15 @@ def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
     deviations. A change is drawn only where it is present.
     """
     data, solution = discovery.residuals, discovery.solution
-    whole = len(data.context) <= MOST_DRAWN
-    context = data.context if whole else data.part
-    remaining = data.unexplained(solution) if whole else data.left(solution)
+    all_rows = len(data.context) <= MOST_DRAWN
+    context = data.context if all_rows else data.part
+    remaining = data.unexplained(solution) if all_rows else data.left(solution)
     # A change is drawn at the rows after its moment, or before if it ends there.
     present = np.ones(len(context), dtype=bool)
     if candidate.changes is not None:
         present = (context.elapsed_s > candidate.moment) != candidate.ends
     fitted = present.copy()
-    if whole:
+    if all_rows:
         fitted &= np.isin(np.arange(len(context)), data.rows.source)
     shown_unit_value, unit = (
         (1e-3, 'mm') if context.slides(candidate.joints[0]) else (ARC_MINUTE, 'arc minutes')

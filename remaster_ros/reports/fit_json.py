@@ -107,8 +107,8 @@ def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
         """RMS displacement by the lengths or tilts, mm; None if the fit has none."""
         stds = [
             std
-            for one, std in zip(geometry.members, geometry.std_m, strict=True)
-            if one.name == name
+            for candidate, std in zip(geometry.members, geometry.std_m, strict=True)
+            if candidate.name == name
         ]
         return 1e3 * float(stds[0]) if stds else None
 

@@ -84,7 +84,7 @@ def earlier_pairs(
     found = _read(path, joint_names)
     if created and (not found.session or found.session.created != created):
         return ()
-    pairs = [(one.cause, one.look_alike) for one in found.decided or ()]
+    pairs = [(decision.cause, decision.look_alike) for decision in found.decided or ()]
     pairs += [
         (Named(effect.name, effect.joints), Named(other.name, other.joints))
         for effect in found.effects

@@ -512,10 +512,10 @@ class _Handler(RequestHandler):
         hosts, origins = headers.get_list('Host'), headers.get_list('Origin')
         if len(hosts) != 1 or hosts[0].lower() not in server.hosts:
             raise HTTPError(421, reason='not a name of this server')
-        own = f'{server.scheme}://{hosts[0].lower()}'
+        own_origin = f'{server.scheme}://{hosts[0].lower()}'
         if self.request.method == 'POST' and not origins:
             raise HTTPError(403, reason='a command needs the header Origin')
-        if origins and origins != [own]:
+        if origins and origins != [own_origin]:
             raise HTTPError(403, reason='the request comes from another page')
 
     def write_error(self, status_code: int, **_: Any) -> None:

@@ -130,8 +130,8 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
         model = of_text(text.encode(), Path(COMPENSATION_FILE)).model
         if replace(geometry, errors=errors_with_correction(model, rows)).is_better:
             return text
-    alone = arm_of_offsets(result, predict(result, rows).widening, geometry=described)
-    return _of_fit(alone, result, result_sha256)
+    offsets_arm = arm_of_offsets(result, predict(result, rows).widening, geometry=described)
+    return _of_fit(offsets_arm, result, result_sha256)
 
 
 def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
@@ -170,17 +170,17 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
     if holds_everything(discovery):
         described = _arm_with_effects(discovery)
         return replace(described, model=replace(described.model, widening=widening))
-    alone = discovery.alone
+    offsets_fit = discovery.alone
     rows = discovery.residuals.context.measurements
     drawn = discovery.geometry
-    geometry = None if drawn is None else arm_of_geometry(alone, drawn, rows)
+    geometry = None if drawn is None else arm_of_geometry(offsets_fit, drawn, rows)
     notes = []
     if discovery.solution.candidates:
         notes.append(
             'zero-offsets alone: the model with everything that was found predicts held-out poses '
             'no better'
         )
-    described = arm_of_offsets(alone, predict(alone, rows).widening, notes, geometry)
+    described = arm_of_offsets(offsets_fit, predict(offsets_fit, rows).widening, notes, geometry)
     uncorrected = tuple(
         NotCorrected(e.name, e.joints, 1e3 * e.size_m, _ALONE, e.remedy) for e in discovery.effects
     )
@@ -193,9 +193,9 @@ def holds_everything(discovery: Discovery) -> bool:
     If there are causes, its correction converges (slope below 1), and its mean error on held-out
     poses is smaller at 0.001 mm, or no poses were held out.
     """
-    alone = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
+    offsets_error = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
-    better = bool(np.isnan(alone)) or round(every, 3) < round(alone, 3)
+    better = bool(np.isnan(offsets_error)) or round(every, 3) < round(offsets_error, 3)
     can_be_commanded = _arm_with_effects(discovery).model.largest_slope() < 1.0
     return better and can_be_commanded and bool(discovery.solution.candidates)
 
@@ -215,16 +215,16 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
     'geometry' is missing without an estimate; 'everything' is NaN if its correction does not
     converge.
     """
-    alone, fit, candidates = discovery.alone, discovery.fit, discovery.solution.candidates
-    session, rows = alone.session, discovery.residuals.context.measurements
+    offsets_fit, fit, candidates = discovery.alone, discovery.fit, discovery.solution.candidates
+    session, rows = offsets_fit.session, discovery.residuals.context.measurements
     # The fit of offsets alone contains no further parameters than certain errors of measuring.
-    measured = without_errors_of_measuring(alone, slice(None))
+    measured = without_errors_of_measuring(offsets_fit, slice(None))
     plain = replace(session, measurements=replace(session.measurements, position=measured))
-    left_out = [observation for observation, _ in alone.left_out]
-    found = {'offsets': errors_with_urdf(plain, exports(alone)[URDF_FILE], left_out)}
+    left_out = [observation for observation, _ in offsets_fit.left_out]
+    found = {'offsets': errors_with_urdf(plain, exports(offsets_fit)[URDF_FILE], left_out)}
     if discovery.geometry is not None:
         found['geometry'] = errors_with_urdf(
-            plain, model_text(alone, discovery.geometry), left_out
+            plain, model_text(offsets_fit, discovery.geometry), left_out
         )
     described = _arm_with_effects(discovery)
     if described.model.largest_slope() < 1.0:

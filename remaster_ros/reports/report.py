@@ -410,7 +410,9 @@ def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
     ``words``: name of the split on the page. Those without an outcome count as not visited.
     """
     poses = plan.tour.plans[split].poses
-    ends = Counter(result for (own, *_), result in plan.outcomes.items() if own == split)
+    ends = Counter(
+        result for (row_split, *_), result in plan.outcomes.items() if row_split == split
+    )
     recorded = sum(ends.pop(result, 0) for result in RECORDED)
     planned = plan.tour.configurations[split]
     missing = planned - recorded - ends.total()
@@ -433,7 +435,7 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
         # off its drawing, it is wider.
         keys = ('model_std', 'std_if_exactly_drawn', 'std')
         stds = [getattr(row, f'{key}_{row.unit}') for key in keys]
-        std = next(one for one in stds if one is not UNSET)
+        std = next(value for value in stds if value is not UNSET)
         before = expected.get(row.joint)
         scale = 1e3 if row.unit == 'mm' else float(np.degrees(1.0))
         shown = None if before is None else scale * before
@@ -551,8 +553,9 @@ def write_answer(
     compensation = next(
         (
             path
-            for one in (found_folder, fit_folder)
-            if one is not None and (path := one / APPLY_FOLDER / COMPENSATION_FILE).exists()
+            for directory in (found_folder, fit_folder)
+            if directory is not None
+            and (path := directory / APPLY_FOLDER / COMPENSATION_FILE).exists()
         ),
         None,
     )

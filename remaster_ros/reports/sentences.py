@@ -405,15 +405,15 @@ def more_than_noise(content: Discovered) -> str:
     Below 92 % of them surely in their regions (`FEWEST_INSIDE`), or an RMS error above 1.25 times
     the noise (`MOST_OVER_NOISE`), plus 1 / √rows.
     """
-    left = 'something is left that the model does not have.'
+    finding = 'something is left that the model does not have.'
     if isinstance(content.session, Struct) and content.session.validation.poses < FEWEST_HELD_OUT:
         # The rows of a pose share its error, which may be large by chance.
-        left = f'{FEW_HELD_OUT}, or {left}'
+        finding = f'{FEW_HELD_OUT}, or {finding}'
     regions, gain = content.predicted_regions95, content.gain
     if isinstance(regions, msgspec.UnsetType) or regions.held_out.interval95 is None:
         return ''
     if regions.held_out.interval95[1] < FEWEST_INSIDE:
-        return f'Fewer held-out rows than should lie where they were predicted: {left}'
+        return f'Fewer held-out rows than should lie where they were predicted: {finding}'
     after = gain.held_out_kept_after_m
     if after is None:
         after = gain.held_out_rms_after_m
@@ -421,7 +421,7 @@ def more_than_noise(content: Discovered) -> str:
     if after is not None and after > most * gain.noise_floor_m:
         return (
             f'The error on held-out poses is {after / gain.noise_floor_m:.1f} times that of the '
-            f'noise alone: {left}'
+            f'noise alone: {finding}'
         )
     return ''
 
@@ -675,9 +675,9 @@ def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
     ``imitations``: the largest ones, each a link or axis and its effect on a joint.
     """
     moved = '; '.join(
-        f'{"link" if one.cause == "link_length" else "the axis of joint"} {one.of} is '
-        f'{one.shown} at {one.joint}'
-        for one in imitations
+        f'{"link" if imitation.cause == "link_length" else "the axis of joint"} {imitation.of} is '
+        f'{imitation.shown} at {imitation.joint}'
+        for imitation in imitations
     )
     return (
         'the standard deviations contain links and axes off their drawing: '
@@ -756,7 +756,9 @@ def fit_lines(fit: Fit) -> list[str]:
     lines += clock_lines(fit.clocks)
     lines += [fit.judgement.headline, *fit.judgement.points]
     if isinstance(fit.geometry, Struct) and (moved := fit.geometry.imitations):
-        lines.append(as_drawn(fit.geometry, [max(moved, key=lambda one: one.as_angle)]))
+        lines.append(
+            as_drawn(fit.geometry, [max(moved, key=lambda imitation: imitation.as_angle)])
+        )
         if fit.geometry.file:
             lines += _to_load(loadable_of_fit(fit.geometry))
     if isinstance(fit.session, Struct) and fit.session.times == 'none':
@@ -863,7 +865,7 @@ def discovery_lines(found: Discovered) -> list[str]:
             f'{other.separate_by}'
             for other in effect.confusable_with
         ]
-    lines += [f'unexplained: {left.next}' for left in found.unexplained or ()]
+    lines += [f'unexplained: {error.next}' for error in found.unexplained or ()]
     lines += _to_load(found.loadable or (), found.effects)
     regions = found.predicted_regions95
     if isinstance(regions, Struct) and (
@@ -881,7 +883,7 @@ def discovery_lines(found: Discovered) -> list[str]:
     lines += [f'other session: {line}' for line in found.judgement.points]
     if not isinstance(found.confirmation, UnsetType):
         lines += _side_by_side(found, found.confirmation)
-    return lines + [one.sentence for one in found.decided or ()]
+    return lines + [decision.sentence for decision in found.decided or ()]
 
 
 def _side_by_side(found: Discovered, confirmation: Confirmation) -> list[str]:

@@ -230,9 +230,9 @@ class Effect:
     ) -> Candidate:
         """Return a candidate of this effect; ``more`` are further arguments of `Candidate`."""
         names = ('name', 'place', 'driver', 'form', 'unit', 'sign')
-        own = {name: getattr(self, name) for name in names}
-        own['largest'] = self.plausible[1] if self.plausible else None
-        return Candidate(columns=columns, parameters=tuple(parameters), **{**own, **more})
+        defaults = {name: getattr(self, name) for name in names}
+        defaults['largest'] = self.plausible[1] if self.plausible else None
+        return Candidate(columns=columns, parameters=tuple(parameters), **{**defaults, **more})
 
     def sentence_of(self, candidates: Iterable[Candidate]) -> str:
         """Return the sentence about candidates of the effect; another one if all joints slide."""
@@ -260,18 +260,18 @@ class Effect:
         the joint; ``more``: further arguments of `Candidate`.
         """
         for joint in joints:
-            own: dict[str, Any] = {}
+            slide_fields: dict[str, Any] = {}
             if context.slides(joint):
                 unit, counts = AT_A_SLIDE[self.unit]
-                own = {'unit': unit, 'driver': driver_at(context, joint, self.driver)}
-                own |= {'slide': True}
+                slide_fields = {'unit': unit, 'driver': driver_at(context, joint, self.driver)}
+                slide_fields |= {'slide': True}
                 if self.plausible:
-                    own['largest'] = counts * self.plausible[1]
+                    slide_fields['largest'] = counts * self.plausible[1]
             yield self.candidate(
                 partial(_added, joint=joint, features=features),
                 [name.format(joint=joint) for name in parameters],
                 joints=(joint,),
-                **{**own, **more},
+                **{**slide_fields, **more},
             )
 
 

@@ -24,8 +24,8 @@ def candidates(context: Context) -> Iterator[Candidate]:
 def _wound(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     """Phrase for the difference of a joint between its two directions of motion."""
     (joint,) = candidate.joints
-    apart = of_joint(context, joint, 2.0 * draws[:, 0])
-    return f'joint {joint} differs by {apart} between its two directions'
+    difference = of_joint(context, joint, 2.0 * draws[:, 0])
+    return f'joint {joint} differs by {difference} between its two directions'
 
 
 EFFECT = Effect(

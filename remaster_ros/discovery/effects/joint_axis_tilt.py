@@ -48,9 +48,11 @@ def tilt_directions(context: Context, joint: int) -> dict[str, FloatArray]:
 
     Along means within 26° of the line of the axis.
     """
-    own = context.chain.axes[joint - 1]
+    joint_axis = context.chain.axes[joint - 1]
     return {
-        name: axis for name, axis in zip('xyz', np.eye(3), strict=True) if abs(axis @ own) < 0.9
+        name: axis
+        for name, axis in zip('xyz', np.eye(3), strict=True)
+        if abs(axis @ joint_axis) < 0.9
     }
 
 

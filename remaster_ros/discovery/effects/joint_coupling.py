@@ -26,10 +26,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
             if other == joint:
                 continue
             pair = f'{joint}_by_{other}'
-            own, of = units[joint - 1], units[other - 1]
+            joint_unit, of = units[joint - 1], units[other - 1]
             for form, unit, parameters, counted in (
-                ('linear', f'{own}/{of}', [f'coupling_{pair}'], 1.0 / counts[other - 1]),
-                ('sin/cos', own, [f'sin_{pair}', f'cos_{pair}'], 1.0),
+                ('linear', f'{joint_unit}/{of}', [f'coupling_{pair}'], 1.0 / counts[other - 1]),
+                ('sin/cos', joint_unit, [f'sin_{pair}', f'cos_{pair}'], 1.0),
             ):
                 if form == 'sin/cos' and context.slides(other):
                     continue

@@ -56,9 +56,9 @@ def _range(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     """Phrase for the range and RMS of a joint's error curve, arc minutes (mm of a slide)."""
     joint = candidate.joints[0]
     values = candidate.columns(context).values
-    one, unit, digits = (MM, ' mm', 3) if candidate.slide else (ARC_MINUTE, '′', 1)
-    middle = values @ draws.mean(axis=0) / one
-    rms = np.sqrt(np.mean((draws[:DRAWS] @ values.T / one) ** 2, axis=1))
+    unit_value, unit, digits = (MM, ' mm', 3) if candidate.slide else (ARC_MINUTE, '′', 1)
+    middle = values @ draws.mean(axis=0) / unit_value
+    rms = np.sqrt(np.mean((draws[:DRAWS] @ values.T / unit_value) ** 2, axis=1))
     ends = ' to '.join(f'{end:+.{digits}f}{unit}' for end in (middle.min(), middle.max()))
     size = number(float(np.sqrt(np.mean(middle**2))), float(rms.std()), unit)
     return f'joint {joint} errs by {ends}, {size} RMS'.replace('-', '−')

@@ -36,10 +36,10 @@ def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatA
     np.maximum.at(last, row, context.elapsed_s)
     order = np.argsort(first)
     first, last = first[order], np.maximum.accumulate(last[order])
-    apart = first[1:] > last[:-1]
+    is_gap = first[1:] > last[:-1]
     edge = max(2, int(LEAST_SHARE * len(first)))
     inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
-    found = np.column_stack([last[:-1], first[1:]])[apart & inside]
+    found = np.column_stack([last[:-1], first[1:]])[is_gap & inside]
     return found[(found[:, 1] > low) & (found[:, 0] < high)]
 
 

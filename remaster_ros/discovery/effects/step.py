@@ -63,8 +63,8 @@ def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
                 subject=name,
             )
         for seen_by in sensors:
-            whole = len(seen_by) > 1
-            subject = '' if whole else context.sensor_names[seen_by[0]]
+            is_base = len(seen_by) > 1
+            subject = '' if is_base else context.sensor_names[seen_by[0]]
             stem = f'{subject or "base"}_step'
             shifts, turns = ([f'{stem}_{kind}{axis}' for axis in 'xyz'] for kind in ('', 'r'))
             for variant, parameters in (('shift', shifts), ('shift and turn', shifts + turns)):
@@ -76,7 +76,7 @@ def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
                         turning=parameters != shifts,
                     ),
                     parameters,
-                    place='base_rotation' if whole else 'sensor_frame',
+                    place='base_rotation' if is_base else 'sensor_frame',
                     variant=variant,
                     subject=subject,
                 )

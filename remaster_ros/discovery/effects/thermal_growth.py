@@ -31,7 +31,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
         for joints in parts:
             # The whole arm first: that one link alone grows is rare. And where the temperature
             # is known, what time explains beyond it is hardly growth.
-            beside = driver.name == 'time' and context.has_temperature
+            is_extra = driver.name == 'time' and context.has_temperature
             yield EFFECT.candidate(
                 partial(_grown, driver=driver, joints=joints),
                 [f'growth_{joints[0]}' if joints else 'growth'],
@@ -41,7 +41,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
                 **({'largest': LARGEST_PER_S} if driver.name == 'time' else {'sign': 1}),
                 unit=f'1/{driver.unit}',
                 drawn_from=(4 * len(parts) if joints else 2)
-                * (BESIDE_TEMPERATURE if beside else 1),
+                * (BESIDE_TEMPERATURE if is_extra else 1),
             )
 
     if context.has_temperature and context.has_time:
