@@ -290,7 +290,7 @@ def _of_fit(path: Path) -> dict[str, Any]:
             side: None if not held_out.get(side) else held_out[side]['mean_mm']
             for side in ('before', 'after')
         },
-        'joints': [_offset(one) for one in content['joint_offsets']],
+        'joints': [_offset(offset) for offset in content['joint_offsets']],
     }
 
 
@@ -319,10 +319,10 @@ def _of_discovery(path: Path) -> dict[str, Any]:
         'headline': content['judgement']['headline'],
         'effects': [
             {
-                **{key: one[key] for key in ('name', 'joints', 'title')},
-                'size_mm': 1e3 * one['size_m'],
+                **{key: effect[key] for key in ('name', 'joints', 'title')},
+                'size_mm': 1e3 * effect['size_m'],
             }
-            for one in content['effects']
+            for effect in content['effects']
         ],
     }
 

@@ -146,7 +146,7 @@ def _seconds(created: str) -> float:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
+def _record(measured: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
     """Record of a check for the history: baseline, arm, session, readings, and time if known."""
     return {
         'format': HISTORY,
@@ -155,11 +155,11 @@ def _record(one: Measured, name: str, sha256: str, baseline: Compensation) -> di
         'joints': list(baseline.model.chain.joint_names),
         'session': name,
         'session_sha256': sha256,
-        'q_rad': one.q.tolist(),
-        'sensor': list(one.sensor),
-        'marker': list(one.marker),
-        'position_m': one.position.tolist(),
-        'when_s': one.when_s if math.isfinite(one.when_s) else None,
+        'q_rad': measured.q.tolist(),
+        'sensor': list(measured.sensor),
+        'marker': list(measured.marker),
+        'position_m': measured.position.tolist(),
+        'when_s': measured.when_s if math.isfinite(measured.when_s) else None,
     }
 
 
@@ -245,11 +245,11 @@ def content_of(
 
     degree = float(np.degrees(1.0))
 
-    def own(one: JointCheck, unit: str) -> dict[str, Any]:
+    def own(check: JointCheck, unit: str) -> dict[str, Any]:
         if unit == 'mm':
             # What it does at the tool is its own change.
-            return {'change_deg': None, 'std_deg': None, 'std_mm': known(one.std, 1e3)}
-        return {'change_deg': known(one.change, degree), 'std_deg': known(one.std, degree)}
+            return {'change_deg': None, 'std_deg': None, 'std_mm': known(check.std, 1e3)}
+        return {'change_deg': known(check.change, degree), 'std_deg': known(check.std, degree)}
 
     return {
         'format': FORMAT,
@@ -259,12 +259,12 @@ def content_of(
             {
                 'joint': name,
                 'unit': unit,
-                **own(one, unit),
-                'change_mm': known(one.change * one.lever_m, 1e3),
-                'detectable_mm': known(one.detectable_m, 1e3),
-                'evidence': one.evidence,
+                **own(check, unit),
+                'change_mm': known(check.change * check.lever_m, 1e3),
+                'detectable_mm': known(check.detectable_m, 1e3),
+                'evidence': check.evidence,
             }
-            for name, one, unit in zip(
+            for name, check, unit in zip(
                 chain.joint_names, found.joints, chain.shown_units, strict=True
             )
         ],
@@ -294,17 +294,17 @@ def _trend(found: CheckResult, joint_names: tuple[str, ...], names: list[str]) -
 
     `found.trend` may not be None.
     """
-    one = found.trend
-    assert one is not None
+    trend = found.trend
+    assert trend is not None
     return {
-        'kind': one.kind,
-        'joints': [joint_names[joint] for joint in one.joints],
-        'tool': one.tool,
-        'size_mm': 1e3 * one.size_m,
-        'half_mm': 1e3 * one.half_m if np.isfinite(one.half_m) else None,
-        'since': names[one.since],
-        'since_check': one.since + 1,
-        'days': one.span if found.in_days else None,
+        'kind': trend.kind,
+        'joints': [joint_names[joint] for joint in trend.joints],
+        'tool': trend.tool,
+        'size_mm': 1e3 * trend.size_m,
+        'half_mm': 1e3 * trend.half_m if np.isfinite(trend.half_m) else None,
+        'since': names[trend.since],
+        'since_check': trend.since + 1,
+        'days': trend.span if found.in_days else None,
     }
 
 
@@ -348,17 +348,17 @@ def _trend_in_words(
 
     `found.trend` may not be None; ``names``: of the checks; ``smallest_mm``: change that matters.
     """
-    one = found.trend
-    assert one is not None
+    trend = found.trend
+    assert trend is not None
     who = ' or '.join(
-        [*(joint_names[joint] for joint in one.joints), *(['the marker'] if one.tool else [])]
+        [*(joint_names[joint] for joint in trend.joints), *(['the marker'] if trend.tool else [])]
     )
-    size, half = 1e3 * one.size_m, 1e3 * one.half_m
+    size, half = 1e3 * trend.size_m, 1e3 * trend.half_m
     small = size + half <= smallest_mm
-    if one.kind == 'drift':
+    if trend.kind == 'drift':
         matters = f'{smallest_mm:g} mm would matter' if small else 'which may matter'
         return (
-            f'Drifting: {who}, {size:.2f} mm at the tool {_span(found, one)}; {matters}. '
+            f'Drifting: {who}, {size:.2f} mm at the tool {_span(found, trend)}; {matters}. '
             f'{_next_in_words(found)}'
         )
     about = (
@@ -369,7 +369,7 @@ def _trend_in_words(
     )
     return (
         f'{who} has changed by {size:.2f} ± {half:.2f} mm at the tool since check '
-        f'{one.since + 1} ({names[one.since]}), {about}. {_next_in_words(found)}'
+        f'{trend.since + 1} ({names[trend.since]}), {about}. {_next_in_words(found)}'
     )
 
 
@@ -386,7 +386,7 @@ def in_words(
     """
     if found.trend is not None:
         return _trend_in_words(found, joint_names, names, smallest_mm)
-    unseen = [n for n, one in zip(joint_names, found.joints) if np.isnan(one.detectable_m)]
+    unseen = [n for n, check in zip(joint_names, found.joints) if np.isnan(check.detectable_m)]
     same = f', or the zero of {" or ".join(unseen)}, which looks the same' if unseen else ''
     if found.verdict == 'changed':
         alike = [joint_names[joint] for joint in found.changed]
@@ -432,8 +432,8 @@ def in_words(
         return 'Something may have changed: check again at once.'
     beyond = [
         name
-        for name, one in zip(joint_names, found.joints, strict=True)
-        if len(names) > 1 and abs(one.change) * one.lever_m > one.detectable_m
+        for name, check in zip(joint_names, found.joints, strict=True)
+        if len(names) > 1 and abs(check.change) * check.lever_m > check.detectable_m
     ]
     if beyond:
         return (
@@ -457,17 +457,17 @@ def _text(content: dict[str, Any]) -> str:
     lines = [content['text'] if drifts else f'{content["verdict"]}: {content["text"]}']
     if not content['changed']:
         lines.append('each joint as if it alone had changed:')
-    for one in content['joints']:
-        if one['detectable_mm'] is None:
-            lines.append(f'  {one["joint"]}: looks like a sensor that was moved; not checked')
+    for check in content['joints']:
+        if check['detectable_mm'] is None:
+            lines.append(f'  {check["joint"]}: looks like a sensor that was moved; not checked')
             continue
-        unit, digits = one['unit'], 3 if one['unit'] == 'mm' else 4
-        std = one[f'std_{unit}']
-        change = f'{one[f"change_{unit}"]:+.{digits}f}'
+        unit, digits = check['unit'], 3 if check['unit'] == 'mm' else 4
+        std = check[f'std_{unit}']
+        change = f'{check[f"change_{unit}"]:+.{digits}f}'
         change += f'{"" if std is None else f" ± {std:.{digits}f}"} {unit}'
         lines.append(
-            f'  {one["joint"]}: {change}, {one["change_mm"]:+.3f} mm at the tool; '
-            f'{one["detectable_mm"]:.2f} mm would be seen'
+            f'  {check["joint"]}: {change}, {check["change_mm"]:+.3f} mm at the tool; '
+            f'{check["detectable_mm"]:.2f} mm would be seen'
         )
     lines.append(
         f'check {content["checks"]}; evidence {content["evidence"]:.2g} (an alarm at 100); noise '

@@ -86,8 +86,8 @@ def _motor(text: str) -> tuple[str, MotorNumber]:
     Raises ArgumentTypeError for another form, counts not above 0, or a direction other than 1 and
     -1.
     """
-    name, _, rest = text.partition('=')
-    parts = rest.split(',')
+    name, _, values = text.partition('=')
+    parts = values.split(',')
     try:
         old, counts = (float(part) for part in parts[:2])
         direction = int(parts[2]) if len(parts) == 3 else 0
@@ -137,24 +137,24 @@ def run(args: argparse.Namespace) -> int:
     if args.base is not None:
         data = read_limited(args.base, URDF_LIMIT, 'name the file that is to be changed')
         base = args.base, decode_text(data, args.base)
-    one = form_content(compensation, args.to, np.random.default_rng(args.seed))
+    form = form_content(compensation, args.to, np.random.default_rng(args.seed))
     files = exported(
-        compensation, args.to, one, base, driver_param=args.driver_param, motors=motors
+        compensation, args.to, form, base, driver_param=args.driver_param, motors=motors
     )
-    files[LEFT_OUT_FILE] = '\n'.join([*one.words, ''])
+    files[LEFT_OUT_FILE] = '\n'.join([*form.words, ''])
     _write(args.out, files)
     content = {
         'format': FORMAT,
         'form': args.to,
         'files': list(files),
         'left_out': {
-            'rms_mm': one.rms_mm,
-            'max_mm': one.max_mm,
-            'parts': [asdict(part) for part in one.parts],
-            'corrected_in_no_form': [left.effect for left in one.uncorrectable],
+            'rms_mm': form.rms_mm,
+            'max_mm': form.max_mm,
+            'parts': [asdict(part) for part in form.parts],
+            'corrected_in_no_form': [entry.effect for entry in form.uncorrectable],
         },
     }
-    tell(args, content, *one.words, f'written: {args.out} ({", ".join(files)})')
+    tell(args, content, *form.words, f'written: {args.out} ({", ".join(files)})')
     return 0
 
 
@@ -170,12 +170,12 @@ def _transforms(args: argparse.Namespace, compensation: Compensation) -> int:
         'format': FORMAT,
         'form': TF,
         'files': list(files),
-        'transforms': [asdict(one) for one in transforms],
+        'transforms': [asdict(transform) for transform in transforms],
     }
     tell(
         args,
         content,
-        *(one.words for one in transforms),
+        *(transform.words for transform in transforms),
         'Right with the whole correction in use, and where no other node publishes these frames.',
         f'to publish: ros2 launch {args.out / LAUNCH_FILE}',
         f'written: {args.out} ({", ".join(files)})',

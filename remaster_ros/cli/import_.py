@@ -325,10 +325,10 @@ def run(args: argparse.Namespace) -> int:
     robot (unless --unchecked); nothing is written then.
     """
     if args.moving and (len(args.files) > 1 or not is_bag(args.files[0])):
-        own = args.files[-1] / 'bag'
+        bag = args.files[-1] / 'bag'
         raise InputError(
             f'{args.files[-1]}: --moving takes one bag, with joint states and frames as recorded'
-            + (f'; that of this session is {own}' if is_bag(own) else '')
+            + (f'; that of this session is {bag}' if is_bag(bag) else '')
         )
     if args.proof is not None and not args.moving:
         raise InputError('--proof is for a bag of a moving arm: give it with --moving')

@@ -209,7 +209,7 @@ def _propose(
         if len(chain) < FREE_JOINTS:
             angle = np.radians(angles[args.sensors[0]])
             facing = reachable_poses(chain, facing, ranges, at, angle, rng)
-        held = propose_held_joint(chain, facing)
+        held_joint = propose_held_joint(chain, facing)
     except InputError as error:
         raise InputError(f'{args.robot}: {error}') from None
     thickness = link_radius(reach, LINK_RADIUS_M)
@@ -222,7 +222,7 @@ def _propose(
         chain=chain,
         tips=tips,
         before=carrying,
-        held=held,
+        held=held_joint,
         reach=reach,
         ranges=ranges,
         kept='',
@@ -250,9 +250,9 @@ def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str]
         except InputError:
             missing.append(name)
             continue
-        package, _, rest = name.removeprefix('package://').partition('/')
+        package, _, relative_path = name.removeprefix('package://').partition('/')
         if name.startswith('package://'):
-            folder = Path(str(path).removesuffix(rest))
+            folder = Path(str(path).removesuffix(relative_path))
             # The folder that holds the package, or the package where it has another name.
             folders[str(folder.parent if folder.name == package else folder)] = None
         elif not Path(name.removeprefix('file://')).is_absolute():
@@ -322,7 +322,7 @@ def _plan(
 
 def _as_text(p: CellProposal) -> str:
     """Return the proposal as text: arm, held joint, kinematics, ranges, missing meshes."""
-    chain, held = p.chain, p.held
+    chain, held_joint = p.chain, p.held
     lines = [
         f'{chain.name}: {len(chain)} joints between {chain.base_link} and {chain.tip_link}'
         + (f' (or {", ".join(p.tips[1:4])})' if len(p.tips) > 1 else ''),
@@ -330,13 +330,15 @@ def _as_text(p: CellProposal) -> str:
         f'reach {p.reach.reach_m:.2f} m; the sensor is taken to be at '
         f'{", ".join(f"{value:.1f}" for value in p.sensor_R)} m',
     ]
-    if held.joint is not None:
-        values = ', '.join(chain.shown_offset(held.joint, v, 0) for v in held.values_held)
-        lines.append(
-            f'{chain.joint_names[held.joint]} is held at {values}, which gives the most '
-            f'joint solutions of a pose: {held.solutions:.1f} on average'
+    if held_joint.joint is not None:
+        values = ', '.join(
+            chain.shown_offset(held_joint.joint, v, 0) for v in held_joint.values_held
         )
-    lines += [held.kinematics.in_words(), p.kept]
+        lines.append(
+            f'{chain.joint_names[held_joint.joint]} is held at {values}, which gives the most '
+            f'joint solutions of a pose: {held_joint.solutions:.1f} on average'
+        )
+    lines += [held_joint.kinematics.in_words(), p.kept]
     if p.missing_meshes:
         lines.append(
             f'warning: {len(p.missing_meshes)} meshes were not found, such as '
@@ -348,16 +350,16 @@ def _as_text(p: CellProposal) -> str:
 
 def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
     """Return the proposal for --json, as plain data."""
-    held = p.held
+    held_joint = p.held
     return {
         'cell': str(out),
         'base_link': p.chain.base_link,
         'tip_link': p.chain.tip_link,
         'not_of_the_arm': list(p.before),
         'other_tips': [tip for tip in p.tips if tip != p.chain.tip_link],
-        'held_joint': None if held.joint is None else p.chain.joint_names[held.joint],
-        'solutions': held.solutions,
-        'inverse_kinematics': _kinematics_as_json(held.kinematics),
+        'held_joint': None if held_joint.joint is None else p.chain.joint_names[held_joint.joint],
+        'solutions': held_joint.solutions,
+        'inverse_kinematics': _kinematics_as_json(held_joint.kinematics),
         'missing_meshes': list(p.missing_meshes),
         'asks': {'emergency_stop_topic': ASKED},
     }

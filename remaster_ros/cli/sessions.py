@@ -27,11 +27,11 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
         return sessions[0][1], []
-    whole, lines = together(sessions)
+    session, lines = together(sessions)
     differing, silent = disagreements(sessions)
     for line in differing:
         log.warning('%s', line)
-    return replace(whole, disagreements=tuple(differing)), [*lines, *silent]
+    return replace(session, disagreements=tuple(differing)), [*lines, *silent]
 
 
 def _one_arm(session: Session, folder: Path) -> Session:

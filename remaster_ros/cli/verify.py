@@ -106,8 +106,8 @@ def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) ->
     for each in dict.fromkeys(configuration.tolist()):
         mine = configuration == each
         q = wanted[mine][0]
-        near = nearest_solution(np.array(list(firsts.values())), q, units) if firsts else None
-        same = each if near is None else list(firsts)[near]
+        neighbour = nearest_solution(np.array(list(firsts.values())), q, units) if firsts else None
+        same = each if neighbour is None else list(firsts)[neighbour]
         numbers[mine], firsts[same] = same, firsts.get(same, q)
     return numbers
 
@@ -236,7 +236,7 @@ def _content(found: VerificationResult, warnings: list[str]) -> dict[str, Any]:
         'text': _in_words(found),
         'toggle': found.toggle and asdict(found.toggle),
         'absolute': asdict(found.absolute),
-        'joints': [{'joint': name, **asdict(one)} for name, one in found.joints.items()],
+        'joints': [{'joint': name, **asdict(estimate)} for name, estimate in found.joints.items()],
         'error_mm': {
             'off': found.error_off and asdict(found.error_off),
             'on': asdict(found.error_on),
@@ -267,7 +267,7 @@ def _text(found: VerificationResult) -> str:
     lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')
     if found.toggle is not None:
         lines.append(f'share that is switched, of on - off: {_share(found.toggle)}')
-    lines += [f'  {name}: {_share(one)}' for name, one in found.joints.items()]
+    lines += [f'  {name}: {_share(estimate)}' for name, estimate in found.joints.items()]
     for side, error in (('off', found.error_off), ('on', found.error_on)):
         if error is not None:
             low, high = error.interval95_mm
@@ -276,6 +276,6 @@ def _text(found: VerificationResult) -> str:
     return '\n'.join([*lines, f'remains: {found.remains_mm:.3f} mm RMS{noise}'])
 
 
-def _share(one: Estimate) -> str:
+def _share(estimate: Estimate) -> str:
     """Return a share with its standard deviation and verdict: '+1.000 ± 0.050 (in_use)'."""
-    return f'{one.share:+.3f} ± {one.std:.3f} ({one.verdict})'
+    return f'{estimate.share:+.3f} ± {estimate.std:.3f} ({estimate.verdict})'

@@ -75,20 +75,20 @@ class CollectionRun:
             self.why = 'waiting for robot_bridge and recorder to confirm the run'
             return False
         else:
-            others = [peer.sender for peer in (bridge, recorder) if peer.run != self.left]
-            if others:
-                reason = f'{" and ".join(others)} did not take part in its run'
+            other_peers = [peer.sender for peer in (bridge, recorder) if peer.run != self.left]
+            if other_peers:
+                reason = f'{" and ".join(other_peers)} did not take part in its run'
             elif bridge.halted:
                 reason = f'the arm is halted: {bridge.halted}'
             elif bridge.asks_for_collect:
                 reason = bridge.asks_for_collect
             elif recorder.changed_run in (self.left, ''):
                 reason = recorder.changed
-        left, self.left = self.left, ''
+        token, self.left = self.left, ''
         if reason:
             self.why = _waits(progress, reason)
-        elif left:
-            self.state, self.why, self.token = 'running', '', left
+        elif token:
+            self.state, self.why, self.token = 'running', '', token
         return True
 
     def refusal(

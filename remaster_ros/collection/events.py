@@ -309,14 +309,14 @@ class ArmModel(msgspec.Struct, frozen=True, kw_only=True):
     urdf_file: str = ''
     cell_file: str = ''
 
-    def difference(self, own: str, other: ArmModel, name: str) -> str:
+    def difference(self, own_name: str, other: ArmModel, name: str) -> str:
         """Difference to the model of another node, a sentence; '' if there is none.
 
-        ``own, name``: names of this node and of the other node; ``other``: model of the other
+        ``own_name, name``: names of this node and of the other node; ``other``: model of the other
         node.
         """
         found = [
-            f'{own} has the {what} {file} (checksum {checksum[:SHORT]}) and {name} has '
+            f'{own_name} has the {what} {file} (checksum {checksum[:SHORT]}) and {name} has '
             f'{other_file} ({other_checksum[:SHORT]})'
             for what, checksum, other_checksum, file, other_file in (
                 ('URDF', self.urdf, other.urdf, self.urdf_file, other.urdf_file),

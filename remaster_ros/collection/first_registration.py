@@ -120,7 +120,7 @@ class FirstRegistration:
         if not found:
             assert failure is not None
             raise failure
-        found.sort(key=lambda one: one[:2])
+        found.sort(key=lambda entry: entry[:2])
         count, rms, T_R_N = found[0]
         limit_m = CLEARLY_WORSE * max(rms, 0.1 * self._allowed_m)
         for other_count, other_rms, other in found[1:]:

@@ -42,16 +42,16 @@ class Pace:
             self._durations_s.extend([each_s] * min(done - self._done, KEPT))
             self._done, self._since_s = done, self._running_s
 
-    def left_s(self, left: int) -> float | None:
-        """Time of ``left`` more configurations, s; None before `FEWEST` are finished.
+    def left_s(self, count: int) -> float | None:
+        """Time of ``count`` more configurations, s; None before `FEWEST` are finished.
 
         At the mean pace of the last `KEPT`; 0 if none is left.
         """
-        if left <= 0:
+        if count <= 0:
             return 0.0
         if len(self._durations_s) < FEWEST:
             return None
-        return left * sum(self._durations_s) / len(self._durations_s)
+        return count * sum(self._durations_s) / len(self._durations_s)
 
 
 def progress_text(counts: Mapping[str, Any], left_s: float | None) -> str:
@@ -62,10 +62,10 @@ def progress_text(counts: Mapping[str, Any], left_s: float | None) -> str:
     done, total = counts['configurations_done'], counts['configurations']
     if counts['phase'] != 'collection' or not total:
         return ''
-    left = minutes_text(left_s)
+    remaining_time = minutes_text(left_s)
     return (
         f'{done} of {total} configurations, {counts["poses_done"]} of {counts["poses"]} poses'
-        f'{f", {left}" if left else ""}'
+        f'{f", {remaining_time}" if remaining_time else ""}'
     )
 
 

@@ -45,8 +45,8 @@ class PeerModels:
         if record.node == self._node:
             return
         if record.model is not None:
-            own, other = (name.rpartition('/')[2] for name in (self._node, record.node))
-            self._peers[record.node] = now, self._model.difference(own, record.model, other)
+            own_name, other = (name.rpartition('/')[2] for name in (self._node, record.node))
+            self._peers[record.node] = now, self._model.difference(own_name, record.model, other)
         elif isinstance(record.body, PlannerState):
             # A node that moves an arm must name it.
             why = f'the records of {record.node} do not tell which arm it plans for: run all nodes'

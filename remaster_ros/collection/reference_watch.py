@@ -59,15 +59,15 @@ def changes(
 def replay(
     watch: ReferenceWatch,
     readings: Sequence[ReferenceReading],
-    others: Sequence[int],
+    other_configurations: Sequence[int],
     T_R_N: Mapping[str, FloatArray],
 ) -> list[SetupChange]:
     """Changes found by the references of a recorded session, round by round.
 
-    ``readings``: in the order measured; ``others``: numbers of the configurations that are not
-    references, in any order.
+    ``readings``: in the order measured; ``other_configurations``: numbers of the configurations
+    that are not references, in any order.
     """
-    other = np.sort(np.asarray(others, dtype=int))
+    other = np.sort(np.asarray(other_configurations, dtype=int))
     found: list[SetupChange] = []
     for i, reading in enumerate(readings):
         if i:
@@ -250,8 +250,8 @@ class ReferenceWatch:
             return self.change
         off = {
             (i, key): self._displacement(row, T_R_N[row.sensor])
-            for i, one in enumerate(self._rounds)
-            for key, row in one.rows.items()
+            for i, reference_round in enumerate(self._rounds)
+            for key, row in reference_round.rows.items()
             if row.sensor in T_R_N
         }
         found = {name: self._noise(name, off) for name in T_R_N}
@@ -296,8 +296,10 @@ class ReferenceWatch:
         if differences.size < FEWEST_FREEDOMS:
             return None
         read = [self._rounds[j].rows[key] for i, key in pairs for j in (i - 1, i)]
-        own = [np.mean(row.std**2) / max(row.samples, 1) for row in read if row.std is not None]
-        least = float(np.mean(own)) if own else 0.0
+        mean_variances = [
+            np.mean(row.std**2) / max(row.samples, 1) for row in read if row.std is not None
+        ]
+        least = float(np.mean(mean_variances)) if mean_variances else 0.0
         variance = max(float(np.mean(differences**2)) / 2.0, least, LEAST_STD_M**2)
         # Successive differences share readings: each further one counts two thirds.
         first = 3 * sum(i == 1 for i, _ in pairs)
@@ -362,11 +364,13 @@ class ReferenceWatch:
         if not places:
             return 1.0
         std, z = np.array(stds), np.array(scaled)
-        whole, single = [], []
+        sensor_p_values, single = [], []
         for sensor, (_, freedoms) in noise.items():
             selection = z[[place.sensor == sensor for place in places]]
             if len(selection):
-                whole.append(scipy.stats.f.sf(np.mean(selection**2), selection.size, freedoms))
+                sensor_p_values.append(
+                    scipy.stats.f.sf(np.mean(selection**2), selection.size, freedoms)
+                )
         freedoms = min(freedoms for _, freedoms in noise.values())
         for cause in causes(self._chain, places):
             signal = (cause.jacobian / std[:, None, None]).reshape(z.size, -1)
@@ -377,7 +381,7 @@ class ReferenceWatch:
                 single.append(
                     scipy.stats.f.sf(explained / basis.shape[1], basis.shape[1], freedoms)
                 )
-        return 2.0 * min(min(tests) * len(tests) for tests in (whole, single) if tests)
+        return 2.0 * min(min(tests) * len(tests) for tests in (sensor_p_values, single) if tests)
 
     def _explain(
         self,
@@ -427,15 +431,15 @@ class ReferenceWatch:
                 x = _centered(course[:, None, None] * per_row, group) * scale[..., None]
                 flat = x.reshape(-1, x.shape[-1])
                 theta, _, rank, _ = np.linalg.lstsq(flat, y.ravel(), rcond=None)
-                left = float(np.sum((y.ravel() - flat @ theta) ** 2))
+                chi2 = float(np.sum((y.ravel() - flat @ theta) ** 2))
                 # A Student t, because the noise is an estimate itself.
-                score = (known + data) * np.log1p(left / known) + rank * np.log(data)
+                score = (known + data) * np.log1p(chi2 / known) + rank * np.log(data)
                 score += LOOKS_ALIKE if step is None else 0.0
-                fits.append((score, left, theta, cause, step))
-        score, left, theta, cause, step = min(fits, key=lambda fit: fit[0])
+                fits.append((score, chi2, theta, cause, step))
+        score, chi2, theta, cause, step = min(fits, key=lambda fit: fit[0])
         freedoms = max(data - len(theta), 1)
-        poor = scipy.stats.f.sf(left / freedoms, freedoms, known)
-        share = np.sqrt(left / max(float(np.sum(y**2)), 1e-300))
+        poor = scipy.stats.f.sf(chi2 / freedoms, freedoms, known)
+        share = np.sqrt(chi2 / max(float(np.sum(y**2)), 1e-300))
         first_new = number if step is None else step
         earlier = [c for i in range(first_new) for c in self._rounds[i].configurations]
         after, before = max(earlier, default=None), min(self._rounds[first_new].configurations)

@@ -301,8 +301,8 @@ def so_far(session: Session, count: int) -> tuple[Session, float, float]:
     if session.references is not None:
         until = np.max(part.measurements.stamp_s)
         every.append(session.references.select(session.references.stamp_s <= until))
-    stamps = np.concatenate([one.stamp_s for one in every])
+    stamps = np.concatenate([rows.stamp_s for rows in every])
     elapsed_s = float(np.ptp(stamps))
     # References have numbers of their own; each visit is a configuration.
-    visits = sum(len(np.unique(one.configuration)) for one in every)
+    visits = sum(len(np.unique(rows.configuration)) for rows in every)
     return part, elapsed_s, elapsed_s / max(1, visits - 1)

@@ -108,22 +108,24 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
     Raises InputError for corrections of an arm with a prismatic joint, of an unknown joint, or of
     joints that are coupled in a circle.
     """
-    told = options.couple or options.reverse or options.add_deg
+    corrections = options.couple or options.reverse or options.add_deg
     if chain.slides.any():
-        if told:
+        if corrections:
             raise InputError(
                 '--couple, --reverse and --offset are for arms whose joints all turn; '
                 f"'{chain.joint_names[int(np.argmax(chain.slides))]}' slides: correct the table"
             )
         return None
-    if rows.angle_unit is None and not told:
+    if rows.angle_unit is None and not corrections:
         return None
     unit: AngleUnit = rows.angle_unit or 'rad'
     names = [split_unit(name)[0] or name for name in rows.joint_columns]
     if len(set(names)) < len(names):
         names = list(chain.joint_names)
     # Columns without names of their own are those of the URDF.
-    names = [own if name.isdigit() else name for name, own in zip(names, chain.joint_names)]
+    names = [
+        urdf_name if name.isdigit() else name for name, urdf_name in zip(names, chain.joint_names)
+    ]
     pads = [PadJoint(name, unit) for name in names]
     for name, (other, sign) in options.couple:
         added = chain.joint_names[_joint_index(other, rows, chain, '--couple')]
@@ -278,8 +280,8 @@ def with_controller_coupling(
         return options, []
     coupled = replace(options, couple=coupling)
     q = [
-        PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
-        for one in (options, coupled)
+        PadAngles.of(controller_of(rows, chain, candidate), chain.joint_names).to_urdf(rows.q)
+        for candidate in (options, coupled)
     ]
     errors = linear_fit(chain, np.array(q), rows.position)[0]
     if len(rows.q) >= FEWEST_ROWS and errors[0] < errors[1]:
@@ -360,13 +362,13 @@ def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, 
     # A rotation by a small angle a moves the columns of its matrix by a * sqrt(2) in all.
     scale = SAME_POSE_M / (SAME_POSE_RAD * np.sqrt(2.0))
     places = np.concatenate((T[:, :3, 3], scale * T[:, :3, :3].reshape(len(q), 9)), axis=1)
-    near = cKDTree(places).query_ball_point(places, SAME_POSE_M)
+    neighbours = cKDTree(places).query_ball_point(places, SAME_POSE_M)
     pose = np.full(len(q), -1)
     count = 0
     for row in range(len(q)):
         if pose[row] < 0:
             # From the first row of a pose, so that a dense path does not become one pose.
-            alike = [other for other in near[row] if pose[other] < 0]
+            alike = [other for other in neighbours[row] if pose[other] < 0]
             pose[alike] = count
             count += 1
     return pose, (

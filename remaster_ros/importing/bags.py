@@ -111,14 +111,14 @@ def _places(topic: str, kind: str, message: Any) -> Iterator[tuple[str, Any, tup
     if kind in PLACES:
         yield topic, message.header, _place(message, PLACES[kind])
         return
-    for one in getattr(message, SEVERAL[kind]):
-        if hasattr(one, 'child_frame_id'):
-            yield one.child_frame_id, one.header, _place(one, 'transform')
-        elif hasattr(one, 'rigid_body_name'):
-            yield f'{topic}/{one.rigid_body_name}', message.header, _place(one, 'pose')
+    for item in getattr(message, SEVERAL[kind]):
+        if hasattr(item, 'child_frame_id'):
+            yield item.child_frame_id, item.header, _place(item, 'transform')
+        elif hasattr(item, 'rigid_body_name'):
+            yield f'{topic}/{item.rigid_body_name}', message.header, _place(item, 'pose')
         else:
-            name = one.marker_name or one.marker_index
-            yield f'{topic}/{name}', message.header, _place(one, 'translation')
+            name = item.marker_name or item.marker_index
+            yield f'{topic}/{name}', message.header, _place(item, 'translation')
 
 
 def read_bag(
@@ -157,8 +157,8 @@ def read_bag(
     if isinstance(bag, RawRows):
         return bag
     rows = _Rows(path, chain, bag.joints.stream(), bag.joint_topic, clock_offset_s)
-    for topic, own in sorted(bag.points.items()):
-        rows.add(topic, own.stream(bag.scale))
+    for topic, points in sorted(bag.points.items()):
+        rows.add(topic, points.stream(bag.scale))
     return rows.raw(sorted(bag.points), length or 'm', bag.unused)
 
 
@@ -201,7 +201,7 @@ def read_streams(
         )
     found, taken = [], set()
     columns = {bag.joint_topic: f'joint angles ({", ".join(chain.joint_names)}), rad'}
-    for name, own in sorted(bag.points.items()):
+    for name, points in sorted(bag.points.items()):
         topic = bag.topic_of[name]
         parts = [part for part in topic.strip('/').split('/') if part]
         own_name = name.rpartition('/')[2] if name != topic else '_'.join(parts[1:])
@@ -210,7 +210,7 @@ def read_streams(
             marker = f'{sensor}_{marker}'
         taken.add(marker)
         columns[name] = f'marker {marker} of sensor {sensor}, {length or "m"}'
-        stamps, values = np.array(own.stamps), np.array(own.values, dtype=float)[:, :3]
+        stamps, values = np.array(points.stamps), np.array(points.values, dtype=float)[:, :3]
         found.append(MarkerStream(sensor, marker, Stream.of(stamps, bag.scale * values)))
     columns |= {topic: 'not used' for topic in bag.unused if topic not in columns}
     return bag.joints.stream(), found, columns
@@ -280,12 +280,12 @@ class _Bag:
         if kind in SEVERAL and not point_topics:
             # Frames of a camera and of the room stand still.
             extent = {
-                name: np.ptp(np.array(one.values)[:, :3], axis=0).max()
-                for name, one in points.items()
+                name: np.ptp(np.array(series.values)[:, :3], axis=0).max()
+                for name, series in points.items()
             }
             points = {
-                name: one
-                for name, one in points.items()
+                name: series
+                for name, series in points.items()
                 if extent[name] > STATIC * max(extent.values())
             } or points
         if len(points) > 1 and not point_topics and kind != next(iter(PLACES)):
@@ -312,8 +312,8 @@ def _require_sensible(
             f'{path}: joint states with angles beyond {LARGEST_RAD:g} rad, which no joint takes; '
             'take another copy of the bag'
         )
-    for one in points.values():
-        far = np.abs(scale * np.array(one.values, dtype=float)[:, :3]) > FARTHEST_M
+    for series in points.values():
+        far = np.abs(scale * np.array(series.values, dtype=float)[:, :3]) > FARTHEST_M
         if far.any():
             raise InputError(
                 f'{path}: points further than {FARTHEST_M:g} m away, beyond any sensor; say their '

@@ -318,10 +318,10 @@ def _joint_columns(
             ):
                 found_here[stem] = tuple(columns[number] for number in numbers)
         # A pendant's words are looked for where the robot's names and numbers do not give all.
-        whole = any(len(columns) == len(joint_names) for columns in found_here.values())
-        if whole or not complete:
+        is_complete = any(len(columns) == len(joint_names) for columns in found_here.values())
+        if is_complete or not complete:
             complete = found_here
-        if whole:
+        if is_complete:
             break
     came_from = [stem for stem in complete if 'from' in stem]
     if came_from:
@@ -502,8 +502,8 @@ def _point_columns(
     _claim(found, tuple(flat.from_iterable(sets)), taken)
     for stem in spreads:
         around = tuple(word for word in stem if word not in {*_SPREAD, 's'})
-        for marker, own in zip(markers, best, strict=True):
-            if len(best) == 1 or around == own:
+        for marker, marker_stem in zip(markers, best, strict=True):
+            if len(best) == 1 or around == marker_stem:
                 found.stds.setdefault(marker, complete[stem])
                 _claim(found, complete[stem], taken)
     return markers
@@ -539,9 +539,9 @@ def _find_orientation(headers: Sequence[_Header], taken: set[int], found: Column
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
         if i not in taken and header.unit in ('', *ANGLES):
-            rest, axis = _orientation_component(header.words)
+            stem, axis = _orientation_component(header.words)
             if axis:
-                groups[rest].setdefault(axis, i)
+                groups[stem].setdefault(axis, i)
     if len(found.points) != 1:
         return
     (marker,) = found.points
@@ -600,17 +600,17 @@ def _orientation_component(words: tuple[str, ...]) -> tuple[tuple[str, ...], str
     """
     turned = {*words} & _TURNED
     for at, word in enumerate(words):
-        others = tuple(w for w in (*words[:at], *words[at + 1 :]) if w not in _TURNED)
+        other_words = tuple(w for w in (*words[:at], *words[at + 1 :]) if w not in _TURNED)
         if any(word in names for names in _ANGLES[:3]):
-            return others, word
+            return other_words, word
         if axis := re.fullmatch(r'(?:q|quat|orientation|rot|r)_?([xyz])|(?:q|quat)_?w', word):
-            return others, axis[1] or 'w'
+            return other_words, axis[1] or 'w'
         if axis := re.fullmatch(r'q([ijkr])', word):
-            return others, _AS_AXIS[axis[1]]
+            return other_words, _AS_AXIS[axis[1]]
         if turned and re.fullmatch(r'[xyzw]|[0-4]', word):
-            return others, word
+            return other_words, word
         if len(words) == 1 and word in 'abcwpr':
-            return others, word
+            return other_words, word
     return (), ''
 
 

@@ -133,12 +133,13 @@ def _smoothing(stamps: FloatArray, values: FloatArray, step: float) -> tuple[flo
     while time_s <= LONGEST_SMOOTHING_S:
         spline = make_smoothing_spline(times, places, lam=time_s**4 / step)
         # The middle of the equivalent kernel, times the step.
-        own = min(0.9, step / (2.0 * np.sqrt(2.0) * time_s))
+        leverage = min(0.9, step / (2.0 * np.sqrt(2.0) * time_s))
         square = float(np.mean((places - spline(times))[10:-10] ** 2))
-        tried.append((square / (1.0 - own) ** 2, time_s, np.sqrt(square / (1.0 - own))))
+        tried.append((square / (1.0 - leverage) ** 2, time_s, np.sqrt(square / (1.0 - leverage))))
         time_s *= SMOOTHING_STEP
     least = min(score for score, _, _ in tried)
     _, time_s, noise = max(
-        (one for one in tried if one[0] <= ALIKE * max(least, 1e-20)), key=lambda one: one[1]
+        (trial for trial in tried if trial[0] <= ALIKE * max(least, 1e-20)),
+        key=lambda trial: trial[1],
     )
     return time_s, float(noise)

@@ -151,25 +151,25 @@ class _Frames:
         period = float(np.median(gaps)) if len(gaps) else 0.0
         if period <= 0.0:
             return None
-        near = gaps < LONGEST_COUNTED * period
+        short_gaps = gaps < LONGEST_COUNTED * period
         for _ in range(2):
             # Of runs without a long gap, each with a beginning of its own.
-            run = np.concatenate(([0], np.cumsum(~near)))
+            run = np.concatenate(([0], np.cumsum(~short_gaps)))
             count = np.concatenate(
-                ([0.0], np.cumsum(np.where(near, np.round(gaps / period), 0.0)))
+                ([0.0], np.cumsum(np.where(short_gaps, np.round(gaps / period), 0.0)))
             )
             here, times = _less_mean(count, run), _less_mean(stamps, run)
             square = float(here @ here)
             if square == 0.0:
                 return None
             period = float(here @ times) / square
-        whole = np.round((stamps - stamps[0]) / period)
-        line = np.polynomial.Polynomial.fit(whole, stamps, 1)
-        steady = line(whole)
+        ticks = np.round((stamps - stamps[0]) / period)
+        line = np.polynomial.Polynomial.fit(ticks, stamps, 1)
+        steady = line(ticks)
         off = np.abs(stamps - steady)
         # Of several in a period the nearest.
-        order = np.lexsort((off, whole))
-        nearest = order[np.diff(whole[order], prepend=-1.0) > 0.0]
+        order = np.lexsort((off, ticks))
+        nearest = order[np.diff(ticks[order], prepend=-1.0) > 0.0]
         kept = np.sort(nearest[off[nearest] < 0.5 * period])
         if len(kept) < AT_A_RATE * len(stamps):
             return None
@@ -250,13 +250,15 @@ class _Recording:
         if guess is not None:
             at_frames = self._seen(motion.at(times), frames.markers, sensor, guess)
             at_middle = self._seen(q, frames.markers, sensor, guess)
-        left = positions - at_frames
-        mean, std, samples = _means(left, block, len(middle))
+        residuals = positions - at_frames
+        mean, std, samples = _means(residuals, block, len(middle))
         if guess is not None:
-            length = np.linalg.norm(left - mean[block], axis=2)
+            length = np.linalg.norm(residuals - mean[block], axis=2)
             far = length > GROSS * max(float(np.nanmedian(length)), 1e-6)
             self.dropped += int(np.sum(far))
-            mean, std, samples = _means(np.where(far[..., None], np.nan, left), block, len(middle))
+            mean, std, samples = _means(
+                np.where(far[..., None], np.nan, residuals), block, len(middle)
+            )
         few = samples < max(1.0, LEAST_FRAMES * usual)
         mean[few], std[few] = np.nan, np.nan
         return _Block(
@@ -305,11 +307,11 @@ class _Recording:
         self.dropped = 0
         names = list(self.frames)
         blocks = [self.blocks(i, float(clock), guess) for i, clock in enumerate(clocks_s)]
-        number = np.unique(np.concatenate([one.number for one in blocks]))
+        number = np.unique(np.concatenate([block.number for block in blocks]))
         segment = _segments(number)
         parts, configurations = [], 0
-        for sensor, (name, one) in enumerate(zip(names, blocks, strict=True)):
-            rows, columns = np.nonzero(np.isfinite(one.position[..., 0]))
+        for sensor, (name, block) in enumerate(zip(names, blocks, strict=True)):
+            rows, columns = np.nonzero(np.isfinite(block.position[..., 0]))
             if len(np.unique(rows)) < FEWEST_ROWS:
                 raise InputError(
                     f'{self.where}: {name} saw the arm move for '
@@ -321,24 +323,24 @@ class _Recording:
             parts.append(
                 Measurements(
                     observation=np.zeros(n, np.int64),
-                    pose=segment[np.searchsorted(number, one.number)][rows],
+                    pose=segment[np.searchsorted(number, block.number)][rows],
                     configuration=configurations + rows,
                     is_validation=np.zeros(n, bool),
-                    stamp_s=one.times[rows],
+                    stamp_s=block.times[rows],
                     sensor=np.full(n, sensor),
                     marker=self.frames[name].markers[columns],
-                    q=one.q[rows],
+                    q=block.q[rows],
                     from_q=np.full((n, k), np.nan),
-                    position=one.position[rows, columns],
-                    std=one.std[rows, columns],
-                    samples=one.samples[rows, columns],
+                    position=block.position[rows, columns],
+                    std=block.std[rows, columns],
+                    samples=block.samples[rows, columns],
                     temperature_c=np.full(n, np.nan),
                     frame=rows,
-                    velocity=one.velocity[rows],
-                    acceleration=one.acceleration[rows],
+                    velocity=block.velocity[rows],
+                    acceleration=block.acceleration[rows],
                 )
             )
-            configurations += len(one.times)
+            configurations += len(block.times)
         joined = _joined(parts)
         if rng is not None:
             joined = replace(joined, is_validation=self._held_out(joined.pose, rng))
@@ -427,35 +429,41 @@ def moving_session(
             'whose joints all turn: import the standstills, without --moving'
         )
     motion = JointMotion.of(joints, where)
-    shots = {one.sensor for one in streams if _rate_hz(one.stream) < LEAST_FRAMES_HZ}
-    streams = [one for one in streams if one.sensor not in shots]
+    shots = {track.sensor for track in streams if _rate_hz(track.stream) < LEAST_FRAMES_HZ}
+    streams = [track for track in streams if track.sensor not in shots]
     if not streams:
         raise InputError(
             f'{where}: {", ".join(sorted(shots))} measured single points, fewer than '
             f'{LEAST_FRAMES_HZ:.0f} in a second, and while the arm moves nothing is measured by '
             'one point; import the standstills, without --moving'
         )
-    markers = list(dict.fromkeys(one.marker for one in streams))
+    markers = list(dict.fromkeys(track.marker for track in streams))
     frames = {
-        sensor: _Frames.of([one for one in streams if one.sensor == sensor], markers)
-        for sensor in dict.fromkeys(one.sensor for one in streams)
+        sensor: _Frames.of([track for track in streams if track.sensor == sensor], markers)
+        for sensor in dict.fromkeys(track.sensor for track in streams)
     }
     recording = _Recording(where, motion, frames, markers, chain, urdf, options)
     found = options.clock_offset_s is None
     clocks_s = np.array(
         [
-            _clock_by_speeds(motion, own, chain, options, markers) if found else 0.0
-            for own in frames.values()
+            _clock_by_speeds(motion, sensor_frames, chain, options, markers) if found else 0.0
+            for sensor_frames in frames.values()
         ]
     ) + (options.clock_offset_s or 0.0)
     clocks_s, guess, error_m = recording.fitted(clocks_s, found)
-    steady = {name: own.at_constant_rate() or own for name, own in frames.items()}
+    steady = {
+        name: sensor_frames.at_constant_rate() or sensor_frames
+        for name, sensor_frames in frames.items()
+    }
     restamped: list[str] = []
-    if any(steady[name] is not own for name, own in frames.items()):
+    if any(steady[name] is not sensor_frames for name, sensor_frames in frames.items()):
         other = _Recording(where, motion, steady, markers, chain, urdf, options)
         again = other.fitted(clocks_s, found)
         if again[2] < error_m:
-            restamped = [_restamped(name, own, steady[name]) for name, own in frames.items()]
+            restamped = [
+                _restamped(name, sensor_frames, steady[name])
+                for name, sensor_frames in frames.items()
+            ]
             recording, (clocks_s, guess, _) = other, again
     session = recording.session(clocks_s, guess, rng)
     m = session.measurements
@@ -520,7 +528,7 @@ def with_proof(session: Session, joints: Stream, name: str, standing: Session) -
             f'{", ".join(markers)}: there is nothing to prove the motion by'
         )
     chosen = s.select(kept)
-    rest = np.zeros_like(chosen.q)
+    zeros = np.zeros_like(chosen.q)
     configurations, index = np.unique(chosen.configuration, return_inverse=True)
     stamps = np.array([chosen.stamp_s[chosen.configuration == c].min() for c in configurations])
     turned = effective_turns(JointMotion.of(joints, name), stamps)[index.reshape(-1)]
@@ -532,8 +540,8 @@ def with_proof(session: Session, joints: Stream, name: str, standing: Session) -
         marker=marker[kept],
         frame=None if chosen.frame is None else 1 + int(m.frame.max()) + chosen.frame,
         from_q=turned,
-        velocity=rest,
-        acceleration=rest,
+        velocity=zeros,
+        acceleration=zeros,
     )
     return replace(session, measurements=_in_order(stacked([m, rows])))
 
@@ -635,10 +643,10 @@ def _joined(parts: Sequence[Measurements]) -> Measurements:
     return _in_order(Measurements(**columns))  # type: ignore[arg-type]
 
 
-def _in_order(whole: Measurements) -> Measurements:
+def _in_order(measurements: Measurements) -> Measurements:
     """Rows in the order of time, sensor and marker, numbered from 0."""
-    order = np.lexsort((whole.marker, whole.sensor, whole.stamp_s))
-    return replace(whole.select(order), observation=np.arange(len(whole)))
+    order = np.lexsort((measurements.marker, measurements.sensor, measurements.stamp_s))
+    return replace(measurements.select(order), observation=np.arange(len(measurements)))
 
 
 def _clock_by_speeds(
@@ -661,13 +669,13 @@ def _clock_by_speeds(
     modelled = np.linalg.norm(np.diff(points, axis=0), axis=1) / SPEED_STEP_S
     modelled[~np.isfinite(motion.at(grid[1:])[:, 0])] = 0.0
     modelled = np.minimum(modelled, 10.0)
-    own = frames.positions[:, 0]
-    seen = np.isfinite(own[:, 0])
+    positions = frames.positions[:, 0]
+    seen = np.isfinite(positions[:, 0])
     if seen.sum() < FEWEST_ROWS:
         return 0.0
     stamps = frames.stamps[seen]
     times = np.arange(stamps[0], stamps[-1], SPEED_STEP_S)
-    path = np.stack([np.interp(times, stamps, column) for column in own[seen].T], axis=1)
+    path = np.stack([np.interp(times, stamps, column) for column in positions[seen].T], axis=1)
     width = max(1, round(2.0 * SPEED_SMOOTHING_S / SPEED_STEP_S))
     measured = np.linalg.norm(path[width:] - path[:-width], axis=1) / (width * SPEED_STEP_S)
     kernel = np.ones(width) / width
@@ -725,28 +733,31 @@ def _robust_fit(session: Session) -> tuple[_Guess, FloatArray, float]:
     design = np.concatenate((jacobian[:, :, free], clocks), axis=2)
     spread = robust_spread(errors, found)
     scale = np.concatenate(
-        [np.full(span.stop - span.start, one) for one, (_, span) in zip(spread, found.spans)]
+        [np.full(span.stop - span.start, sigma) for sigma, (_, span) in zip(spread, found.spans)]
     )
     residual, by_z = prior_rows(model, priors, z)
     pull = np.concatenate((by_z[:, free], np.zeros((len(by_z), len(model.sensor_names)))), axis=1)
-    left, solution = errors, np.zeros(design.shape[2])
+    misfits, solution = errors, np.zeros(design.shape[2])
     for _ in range(10):
         width = CAUCHY_WIDTH * scale
-        root = 1.0 / np.sqrt(1.0 + np.sum(left**2, axis=1) / width**2) / scale
+        root = 1.0 / np.sqrt(1.0 + np.sum(misfits**2, axis=1) / width**2) / scale
         matrix = np.concatenate(
             ((design * root[:, None, None]).reshape(-1, design.shape[2]), pull)
         )
         right = np.concatenate(((errors * root[:, None]).ravel(), -residual))
         unit = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
         solution = np.linalg.lstsq(matrix / unit, right, rcond=1e-12)[0] / unit
-        left = errors - design @ solution
-        spread = robust_spread(left, found)
+        misfits = errors - design @ solution
+        spread = robust_spread(misfits, found)
         scale = np.concatenate(
-            [np.full(span.stop - span.start, one) for one, (_, span) in zip(spread, found.spans)]
+            [
+                np.full(span.stop - span.start, sigma)
+                for sigma, (_, span) in zip(spread, found.spans)
+            ]
         )
     moved = z.copy()
     moved[free] += solution[: len(free)]
     # Far from the right clock the step of the rest goes too far.
     x = model.natural(moved if np.all(np.abs(solution[len(free) :]) < 5e-3) else z)
     guess = _Guess(model.offsets(x), model.markers(x), inverse(model.T_R_N(x)))
-    return guess, solution[len(free) :], float(np.median(np.linalg.norm(left, axis=1)))
+    return guess, solution[len(free) :], float(np.median(np.linalg.norm(misfits, axis=1)))

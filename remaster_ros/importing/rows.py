@@ -291,24 +291,24 @@ def _pairs_by_time(points: Table, joints: Table, within_s: float) -> Pairs | Non
     nearer = np.where(
         np.abs(reported[after] - when) < np.abs(reported[before] - when), after, before
     )
-    near = np.abs(reported[nearer] - when) <= within_s
+    has_report = np.abs(reported[nearer] - when) <= within_s
     table = points[0]
-    if not near.any():
+    if not has_report.any():
         raise InputError(
             f'{table.path}: its times ({_span(when)}) are not those of {joints[0].path} '
             f'({_span(reported)}); set the clocks equal, or join by name or by order (--join)'
         )
     # Where both neighbours are near, the joints are a stream: it tells whether the arm moved.
     q = numbers(joints[0], joints[1].joints)
-    _refuse_equal_times(joints, reported, order, q, nearer[near])
+    _refuse_equal_times(joints, reported, order, q, nearer[has_report])
     still = _STILL_DEG if np.abs(q).max(initial=0.0) > 2.1 * np.pi else np.deg2rad(_STILL_DEG)
-    stream = near & (np.abs(reported[before] - when) <= within_s)
+    stream = has_report & (np.abs(reported[before] - when) <= within_s)
     stream &= np.abs(reported[after] - when) <= within_s
     moved = stream & (np.abs(q[order[before]] - q[order[after]]).max(axis=1) > still)
-    kept = near & ~moved
+    kept = has_report & ~moved
     left_out = []
     for why, rows in (
-        (f'no joints within {within_s:g} s', np.flatnonzero(~near)),
+        (f'no joints within {within_s:g} s', np.flatnonzero(~has_report)),
         ('measured while the arm moved', np.flatnonzero(moved)),
     ):
         if len(rows):
@@ -509,16 +509,19 @@ def read_rows(
         tables = [with_poses(table) for table in tables]
         found = with_columns(tables)
     _refuse_absent_columns(found, options.chosen)
-    whole = [pair for pair in found if pair[1].points and pair[1].joints]
-    if len(whole) == 1 and all(table.part for table, _ in found):
+    complete_tables = [pair for pair in found if pair[1].points and pair[1].joints]
+    if len(complete_tables) == 1 and all(table.part for table, _ in found):
         # Beside it a workbook has sums, and an archive other arrays.
-        found = whole
+        found = complete_tables
     with_points = _prefer_chosen([pair for pair in found if pair[1].points], 'points')
     with_joints = _prefer_chosen([pair for pair in found if pair[1].joints], 'joints')
     # A log of joints may have where the robot believes its tool to be.
-    alone = [pair for pair in with_points if not pair[1].joints]
+    point_tables = [pair for pair in with_points if not pair[1].joints]
     points = _single_table(
-        alone if len(alone) == 1 else with_points, tables, 'a measured point (X, Y, Z)', '--points'
+        point_tables if len(point_tables) == 1 else with_points,
+        tables,
+        'a measured point (X, Y, Z)',
+        '--points',
     )
     # Where the points' table repeats the joints, those of the other table were meant.
     joints = _single_table(
@@ -571,8 +574,8 @@ def read_rows(
         description += still.description
         warnings += still.warnings
     else:
-        points, joints, left = _without_incomplete_rows(points, joints)
-        warnings += left
+        points, joints, omissions = _without_incomplete_rows(points, joints)
+        warnings += omissions
     if still is None and joints[0] is not points[0]:
         pairs = join(points, joints, options.join, options.within_s)
         description.append(f'{len(pairs.points)} rows joined {pairs.criterion}')
@@ -642,8 +645,10 @@ def _in_move_order(data: TextTable, program: Path) -> TextTable:
         note = f'{program.name}: its moves name no point of {data.path.name}, whose order is kept'
         return replace(data, notes=(*data.notes, note))
     notes = data.notes
-    if left := sorted(set(order).difference(named)):
-        notes += (f'{program.name}: moves to {", ".join(left)} were left out: no axis positions',)
+    if stray_names := sorted(set(order).difference(named)):
+        notes += (
+            f'{program.name}: moves to {", ".join(stray_names)} were left out: no axis positions',
+        )
     return replace(data.select(kept), notes=notes)
 
 
@@ -666,7 +671,9 @@ def _raw_rows(
     q, units, scale = joint_values(*joints, chain, options.angles)
     angle = next((unit for unit, _ in units if unit in ANGLES), None)
     several = len(columns.points) > 1
-    raw = np.array([numbers(table, own, several) for own in columns.points.values()])
+    raw = np.array(
+        [numbers(table, marker_columns, several) for marker_columns in columns.points.values()]
+    )
     _refuse_part_of_a_point(table, columns, raw)
     # A row of the table for each marker that was seen in it.
     row, marker = np.nonzero(np.isfinite(raw[:, :, 0]).T)
@@ -677,8 +684,8 @@ def _raw_rows(
     refuse_far(table, columns, length)
     names = list(columns.points)
     if several:
-        moved, left = _markers_on_arm(raw, names, table)
-        warnings += left
+        moved, omissions = _markers_on_arm(raw, names, table)
+        warnings += omissions
         row, marker = row[moved[marker]], marker[moved[marker]]
     n, k = q.shape
     from_q = np.full((n, k), np.nan)
@@ -705,16 +712,16 @@ def _raw_rows(
         warnings += (equal,)
     given = {}
     for kind in _OTHERS:
-        for one, found in (points, joints):
+        for text_table, found in (points, joints):
             column = found.first_of_kind(kind)
             if column is not None and kind not in given:
-                given[kind] = [one.rows[i][column] for i in row]
+                given[kind] = [text_table.rows[i][column] for i in row]
     if several:
         given['marker'] = [names[i] for i in marker]
     meanings: dict[str, str] = {}
     both = [points] if joints[0].path == table.path else [points, joints]
-    for one, found in both:
-        prefix = f'{one.path.name}: ' if len(both) > 1 else ''
+    for text_table, found in both:
+        prefix = f'{text_table.path.name}: ' if len(both) > 1 else ''
         is_joints, is_points = found is joints[1], found is columns
         meaning = _column_meanings(
             found if is_joints else replace(found, joints=(), from_joints=(), efforts=()),
@@ -723,7 +730,8 @@ def _raw_rows(
             f'{length} ({how_length})' if is_points else '',
         )
         meanings |= {
-            f'{prefix}{name}': meaning.get(i, 'not used') for i, name in enumerate(one.names)
+            f'{prefix}{name}': meaning.get(i, 'not used')
+            for i, name in enumerate(text_table.names)
         }
     return RawRows(
         source=tuple(table.at(int(i)) for i in row),
@@ -739,7 +747,10 @@ def _raw_rows(
         columns=meanings,
         description=description,
         warnings=warnings,
-        points={name: tuple(table.names[i] for i in own) for name, own in columns.points.items()},
+        points={
+            name: tuple(table.names[i] for i in marker_columns)
+            for name, marker_columns in columns.points.items()
+        },
         length_unit=length,
         angle_unit=cast(AngleUnit | None, angle),
         reading=row if several else None,
@@ -873,10 +884,10 @@ def _column_meanings(
             found.setdefault(i, f'{kind}joint {joint + 1} ({name}), {unit}{how(i)}')
     for name, i in zip(chain.joint_names, columns.efforts):
         found.setdefault(i, f'torque of {name}, N m')
-    for marker, own in columns.points.items() if length else ():
+    for marker, marker_columns in columns.points.items() if length else ():
         of = f'marker {marker}' if marker else 'the marker'
         spread, turned = columns.stds.get(marker, ()), columns.orientations.get(marker, ())
-        for axis, i in zip(AXES, own):
+        for axis, i in zip(AXES, marker_columns):
             found.setdefault(i, f'{axis} of {of}, {length}{how(i)}')
         for axis, i in zip(AXES, spread):
             found.setdefault(i, f'standard deviation of {axis} of {of}, {length}')
@@ -897,8 +908,8 @@ def _choice_for_table(
 
     If all `tables` have names, numbers count for all. See `_choice_for_file`.
     """
-    of_table = _choice_for_file(chosen, table.path, [one.path for one in tables])
-    if not table.has_header or all(one.has_header for one in tables):
+    of_table = _choice_for_file(chosen, table.path, [text_table.path for text_table in tables])
+    if not table.has_header or all(text_table.has_header for text_table in tables):
         return of_table
     points, joints = (
         () if names and all(map(str.isdigit, names)) else names
@@ -919,7 +930,7 @@ def _choice_for_file(chosen: ColumnChoice, path: Path, paths: Sequence[Path]) ->
                 if names and names[0].startswith(f'{name}:'):
                     names_of_file = (names[0][len(name) + 1 :], *names[1:])
                     names = names_of_file if other == path else ()
-        of_file[kind] = tuple(one for name in names for one in _expanded_range(name))
+        of_file[kind] = tuple(column for name in names for column in _expanded_range(name))
     return replace(chosen, joints=of_file['joints'], points=of_file['points'])
 
 

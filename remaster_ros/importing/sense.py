@@ -229,10 +229,10 @@ def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sen
                 fitting[name] = fitted.error_m
     if not fitting:
         return None
-    others = [name for name in session.markers if name not in fitting]
+    other_markers = [name for name in session.markers if name not in fitting]
     fitting_names = ', '.join(fitting)
-    if others:
-        why = f'without {", ".join(others)}; is that on the tool?'
+    if other_markers:
+        why = f'without {", ".join(other_markers)}; is that on the tool?'
     else:
         why = 'each alone; were they computed from one another? Points of one body turn with it'
     name = next(iter(fitting))

@@ -117,15 +117,19 @@ def corrected_session(session: Session, arrangement: Arrangement) -> Session:
     """
     if arrangement == Arrangement.given(len(arrangement.order)):
         return session
-    whole = arranged(replace(session, measurements=all_rows(session)), arrangement)
+    arranged_session = arranged(replace(session, measurements=all_rows(session)), arrangement)
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
-    whole = replace(whole, controller=_controller(session, arrangement, chain.joint_names))
-    m = whole.measurements
+    arranged_session = replace(
+        arranged_session, controller=_controller(session, arrangement, chain.joint_names)
+    )
+    m = arranged_session.measurements
     if m.is_reference is None:
-        return whole
+        return arranged_session
     rows = replace(m, is_reference=None)
     return replace(
-        whole, measurements=rows.select(~m.is_reference), references=rows.select(m.is_reference)
+        arranged_session,
+        measurements=rows.select(~m.is_reference),
+        references=rows.select(m.is_reference),
     )
 
 

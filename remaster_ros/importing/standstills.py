@@ -289,7 +289,7 @@ def match(
             )
     offsets = [offset_s] if offset_s is not None else [0.0, *_offsets(points, joints)]
     found = [_matching(points, joints, offset, error_of) for offset in offsets]
-    found = [one for one in found if len(one.points)]
+    found = [matching for matching in found if len(matching.points)]
     if offset_s is not None:
         if not found:
             raise InputError(
@@ -300,32 +300,44 @@ def match(
     if len(points) == len(joints):
         order = np.arange(len(points))
         found.append(_judged(order, order, None, None, error_of))
-    right = [one for one in found if one.error is not None and one.error < _LARGEST_ERROR]
+    right = [
+        matching
+        for matching in found
+        if matching.error is not None and matching.error < _LARGEST_ERROR
+    ]
     if right:
-        least = min(one.error for one in right if one.error is not None)
+        least = min(matching.error for matching in right if matching.error is not None)
         # Twice the least: what a few wrong pairs add.
-        found = [one for one in right if one.error is not None and one.error <= 2.0 * least]
+        found = [
+            matching
+            for matching in right
+            if matching.error is not None and matching.error <= 2.0 * least
+        ]
     else:
-        found = [one for one in found if one.offset_s is not None]
+        found = [matching for matching in found if matching.offset_s is not None]
     if not found:
         raise InputError(
             f'{names[0]} and {names[1]}: no offset of their clocks brings their standstills '
             f'together ({len(points)} and {len(joints)}); are they of the same run? state the '
             'offset with --clock-offset, or join by name or by order (--join)'
         )
-    most = max(len(one.points) for one in found)
-    likely = [one for one in found if len(one.points) >= _ALIKE * most]
+    most = max(len(matching.points) for matching in found)
+    likely = [matching for matching in found if len(matching.points) >= _ALIKE * most]
     # Clocks that are the same need no robot: a part of the points is measured in motion then.
-    same = [one for one in found if one.offset_s == 0.0 and 2 * len(one.points) >= most]
+    same = [
+        matching
+        for matching in found
+        if matching.offset_s == 0.0 and 2 * len(matching.points) >= most
+    ]
     likely = likely if right else same or likely
-    best = max(likely, key=lambda one: (one.offset_s == 0.0, len(one.points)))
+    best = max(likely, key=lambda matching: (matching.offset_s == 0.0, len(matching.points)))
     rivals = [
-        one.offset_s
-        for one in likely
-        if one.offset_s is not None
+        matching.offset_s
+        for matching in likely
+        if matching.offset_s is not None
         and best.offset_s is not None
-        and abs(one.offset_s - best.offset_s) > STREAM_S
-        and not np.array_equal(one.joints, best.joints)
+        and abs(matching.offset_s - best.offset_s) > STREAM_S
+        and not np.array_equal(matching.joints, best.joints)
     ]
     if rivals and not right and best.offset_s != 0.0:
         listed = ', '.join(
@@ -376,27 +388,27 @@ def _matching(
     if not len(begins) + len(ends):
         return _judged(a, b, offset, None, error_of)
     # What is found to stand still for longer begins earlier and ends later: that is no offset.
-    refined = float(np.mean([np.median(one) for one in (begins, ends) if len(one)]))
+    refined = float(np.mean([np.median(edges) for edges in (begins, ends) if len(edges)]))
     if offset == 0.0 and abs(refined) <= _SAME_CLOCK_S:
         # Clocks that are the same but for how the standstills are found stay so.
         refined = 0.0
-    apart = np.abs(np.concatenate((begins, ends)) - refined)
-    return _judged(a, b, refined, float(np.median(apart)), error_of)
+    differences = np.abs(np.concatenate((begins, ends)) - refined)
+    return _judged(a, b, refined, float(np.median(differences)), error_of)
 
 
 def _judged(
     i: IntArray,
     j: IntArray,
     offset: float | None,
-    apart: float | None,
+    difference: float | None,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
     """Matching of pairs (indices of points `i` and joints `j`), with the residual of the robot.
 
-    The residual is None for fewer than 11 pairs. `offset`, `apart`: s.
+    The residual is None for fewer than 11 pairs. `offset`, `difference`: s.
     """
     error = error_of(i, j) if len(i) >= _FEWEST_FOR_ROBOT else None
-    return Matching(i, j, offset, apart, error)
+    return Matching(i, j, offset, difference, error)
 
 
 def _offsets(points: Standstills, joints: Standstills) -> list[float]:
@@ -411,13 +423,13 @@ def _offsets(points: Standstills, joints: Standstills) -> list[float]:
         (joints.begin[joints.opened][None] - points.begin[points.opened][:, None]).ravel(),
         (joints.end[joints.closed][None] - points.end[points.closed][:, None]).ravel(),
     ]
-    apart = np.sort(np.concatenate(differences))
-    if not len(apart):
-        apart = np.sort((joints.begin[None] - points.begin[:, None]).ravel())
-    count = np.searchsorted(apart, apart + _TOLERANCE_S, side='right') - np.arange(len(apart))
+    lags = np.sort(np.concatenate(differences))
+    if not len(lags):
+        lags = np.sort((joints.begin[None] - points.begin[:, None]).ravel())
+    count = np.searchsorted(lags, lags + _TOLERANCE_S, side='right') - np.arange(len(lags))
     offsets: list[float] = []
     for at in np.argsort(-count, kind='stable'):
-        offset = float(np.median(apart[at : at + count[at]]))
+        offset = float(np.median(lags[at : at + count[at]]))
         if all(abs(offset - other) > _TOLERANCE_S for other in offsets):
             offsets.append(offset)
         if len(offsets) == _MOST_OFFSETS or count[at] < 0.5 * count.max():
@@ -599,9 +611,9 @@ def _by_order(
     reported: FloatArray,
     unit: float,
     names: tuple[str, str],
-    told: bool,
+    is_stated: bool,
 ) -> Stopped:
-    """Pair points without times with equally many standstills, if the robot agrees or `told`.
+    """Pair points without times with equally many standstills, if the robot agrees or `is_stated`.
 
     The robot agrees if it fits the first marker of 11 points or more to 15 % of their extent.
     `reported`: times of the joints' rows, s; `unit`: of their angles, rad. Raises InputError if
@@ -616,7 +628,7 @@ def _by_order(
             'the points the times at which they were measured'
         )
     order = np.arange(len(still))
-    if not told:
+    if not is_stated:
         of_first = raw[rows, : len('xyz')]
         known = np.flatnonzero(np.isfinite(of_first).all(axis=1))
         error = np.inf
@@ -628,7 +640,7 @@ def _by_order(
                 f'standstills in {names[1]}; give them the times at which they were measured, or '
                 'say --join order if they are right so'
             )
-    what = 'by their order, as told' if told else 'by their order, with which the robot fits'
+    what = 'by their order, as told' if is_stated else 'by their order, with which the robot fits'
     return Stopped(
         (points[0].select(rows.tolist()), points[1]),
         _at_rest(joints, still, order, reported, unit),
@@ -688,15 +700,15 @@ def _rows_of(stamps: FloatArray, when: FloatArray) -> IntArray:
 def _scale(
     points: Table,
     chain: SerialChain,
-    told: str,
+    stated_unit: str,
     stream: Stream,
     windows: FloatArray,
     still: Standstills,
 ) -> float:
     """Scale of the points to m, from their unit; 1 if no window has a point.
 
-    By the stated unit (`told`), the header, or the modelled tool at the standstills. `windows`:
-    begin and end of each by the points' clock, s, (n, 2).
+    By the stated unit (`stated_unit`), the header, or the modelled tool at the standstills.
+    `windows`: begin and end of each by the points' clock, s, (n, 2).
     """
     parts = [stream.values[between(stream, *window)] for window in windows]
     seen = [j for j, part in enumerate(parts) if len(part)]
@@ -704,7 +716,7 @@ def _scale(
         return 1.0
     raw = np.array([np.median(parts[j], axis=0) for j in seen])
     modelled = chain.forward(still.mean[seen])[:, :3, 3]
-    return LENGTHS[length_unit(*points, told, raw, modelled)[0]]
+    return LENGTHS[length_unit(*points, stated_unit, raw, modelled)[0]]
 
 
 def _means(
@@ -723,8 +735,10 @@ def _means(
     }
     width = len(table.names) + 3 * len(spread)
     streams = {}
-    for name, own in columns.points.items():
-        both = numbers(table, (*own, *columns.orientations.get(name, ())), optional=True)
+    for name, marker_columns in columns.points.items():
+        both = numbers(
+            table, (*marker_columns, *columns.orientations.get(name, ())), optional=True
+        )
         streams[name] = Stream.of(when, np.column_stack((both, np.arange(len(both)))))
     at, rows, lines, unsteady = [], [], [], 0
     for j, window in enumerate(windows):
@@ -757,8 +771,8 @@ def _means(
             at.append(j)
             rows.append(tuple(cells))
     names = [f'std {axis} of {name or "the point"}' for name in spread for axis in 'xyz']
-    others = {kind: list(of) for kind, of in columns.others.items()}
-    others['samples'] = [width]
+    other_columns = {kind: list(of) for kind, of in columns.others.items()}
+    other_columns['samples'] = [width]
     return (
         np.array(at, dtype=np.int64),
         (
@@ -769,7 +783,10 @@ def _means(
                 lines=tuple(lines),
             ),
             replace(
-                columns, stds=spread, others=defaultdict(list, others), ambiguous_orientation=()
+                columns,
+                stds=spread,
+                others=defaultdict(list, other_columns),
+                ambiguous_orientation=(),
             ),
         ),
         unsteady,

@@ -482,7 +482,7 @@ def _with_lists_as_columns(
             if width and not _list_in_cell(cell) and not is_missing(cell):
                 # The name of a column of lists.
                 parts += [
-                    f'{cell} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))
+                    f'{cell} {suffix}' for suffix in ('xyz' if width == 3 else range(1, width + 1))
                 ]
             elif width and is_missing(cell):
                 parts += width * ['']

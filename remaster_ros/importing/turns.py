@@ -55,8 +55,8 @@ def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions)
     if rows.coupling and not chain.slides.any():
         options_tried.append(replace(options, couple=(*options.couple, *rows.coupling.items())))
     joints = [
-        PadAngles.of(controller_of(rows, chain, one), chain.joint_names).to_urdf(rows.q)
-        for one in options_tried
+        PadAngles.of(controller_of(rows, chain, candidate), chain.joint_names).to_urdf(rows.q)
+        for candidate in options_tried
     ]
     arms = [chain.forward(q) for q in joints]
     if rows.ambiguous_orientation is None:
@@ -81,24 +81,24 @@ def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions)
     ]
     if not found:
         return _without_orientation(rows, 'are no quaternions')
-    found.sort(key=lambda one: one[0])
+    found.sort(key=lambda candidate: candidate[0])
     error, words, xyzw = found[0]
-    others = [
+    alternatives = [
         other
         for differences, _, other in found[1:]
         if differences < max(2.0 * error, error + OTHER_RAD)
     ]
     if (
         min(
-            _orientation_error(rows, one, arms, options.on_tool, ignore_points=True)
-            for *_, one in found
+            _orientation_error(rows, candidate, arms, options.on_tool, ignore_points=True)
+            for *_, candidate in found
         )
         < COMPUTED_RAD
     ):
         return _without_orientation(rows, _OF_THE_ROBOT)
     if error > AGREE_RAD:
         return _without_orientation(rows, 'turn otherwise than the arm, however they are read')
-    if any(_differ(xyzw, other) for other in others):
+    if any(_differ(xyzw, other) for other in alternatives):
         return _without_orientation(rows, 'can be read in several ways, which fit the arm alike')
     return replace(
         rows,

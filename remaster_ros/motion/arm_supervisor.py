@@ -450,8 +450,8 @@ class ArmSupervisor:
         """
         limit = self.rules.heartbeat_s
         silent = self._interlocks.silence_s('robot', self._wall) > limit
-        others = silent and self._wall - self._others_wall <= limit
-        return self._interlocks.reason('robot') or (self._others if others else '')
+        has_other_joints = silent and self._wall - self._others_wall <= limit
+        return self._interlocks.reason('robot') or (self._others if has_other_joints else '')
 
     def report_age_s(self, wall_s: float) -> float:
         """Time since a report was believed, s; infinite if none was.

@@ -204,7 +204,9 @@ class Following:
         if behind <= ON_PATH_RAD:
             return ''
         # A moment ago it went on, and now it does not.
-        last, _, lag_last = next(one for one in reversed(self._trail) if now - one[0] >= JUST_S)
+        last, _, lag_last = next(
+            entry for entry in reversed(self._trail) if now - entry[0] >= JUST_S
+        )
         moments = (passed_s, lag_before), (now - last, lag_last)
         grows = any(lag - then > SLOWED_SHARE * since_s for since_s, then in moments)
         stands = largest(q - q_before) < STANDS_SHARE * behind
@@ -304,8 +306,8 @@ class Following:
         """
         start, units = self.trajectory.start, self._rules.units
         longest = units.largest(self.trajectory.points - start)
-        away = units.largest(seen.q - start)
-        return longest > ON_PATH_RAD and away <= self._rules.settle.arrive_tolerance
+        distance = units.largest(seen.q - start)
+        return longest > ON_PATH_RAD and distance <= self._rules.settle.arrive_tolerance
 
     def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
         """Return the lag of `q`, s, its offset from the path, (k,), and whether the arm is near.
@@ -328,8 +330,8 @@ class Following:
             place = line.place(share)
             is_near = units.largest(line.at(gone_s)[0] - place) <= ON_PATH_RAD
             found.append((off, lag, is_near, q - place))
-        _, lag, is_near, beside = min(found, key=lambda one: one[:3])
-        return lag, beside, is_near
+        _, lag, is_near, offset = min(found, key=lambda candidate: candidate[:3])
+        return lag, offset, is_near
 
 
 def path_tolerance(speeds: FloatArray, rules: SupervisorRules) -> FloatArray:

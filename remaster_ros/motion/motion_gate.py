@@ -185,11 +185,11 @@ class MotionGate:
             raise LookupError('no move is under way')
         trajectory, limits, path = self._under_way
         piece = piece_of(trajectory, sent_s, horizon_s)
-        first, *rest = piece.waypoints
+        first, *remaining = piece.waypoints
         try:
-            if not rest:
+            if not remaining:
                 raise MotionRefusedError('nothing is left of the move')
-            self._check(rest, first, path, limits)
+            self._check(remaining, first, path, limits)
         except MotionRefusedError:
             self.refused += 1
             raise
@@ -235,8 +235,8 @@ class MotionGate:
         limits = self.limits
         farthest = np.maximum(q - limits.lower, limits.upper - q)
         farthest = np.where(np.isfinite(farthest), farthest, FULL_TURN)
-        near = START_RAD * limits.units.per_radian
-        way = np.where(doubtful, np.maximum(farthest, near), near)
+        tolerance = START_RAD * limits.units.per_radian
+        way = np.where(doubtful, np.maximum(farthest, tolerance), tolerance)
         times = [
             PROBE_S,
             *(CUBIC_PEAK * way / limits.velocity),
@@ -421,7 +421,9 @@ class ForeignGate:
             raise MotionRefusedError('the trajectory does not end at rest')
         # All pieces in one: a planner's trajectory has a hundred.
         times = np.array([point.time_s for point in points])[:, None]
-        places, speeds = (np.array([getattr(p, one) for p in points]) for one in ('q', 'velocity'))
+        places, speeds = (
+            np.array([getattr(p, field) for p in points]) for field in ('q', 'velocity')
+        )
         if is_straight:
             with np.errstate(divide='ignore', invalid='ignore'):
                 # The lines that a controller draws without velocities.
@@ -439,9 +441,9 @@ class ForeignGate:
         _check_rate('acceleration', largest, limits.acceleration, 's2', limits)
         if is_straight:
             # Where two lines meet, and at rest before the first and behind the last.
-            rest = np.zeros_like(q)
-            begins = velocity if waypoints[0].time_s > 0.0 else rest
-            rates = np.vstack((begins, first, rest))
+            zeros = np.zeros_like(q)
+            begins = velocity if waypoints[0].time_s > 0.0 else zeros
+            rates = np.vstack((begins, first, zeros))
             steps = np.abs(np.diff(rates, axis=0)).max(axis=0)
             _check_rate('step of its speed', steps, STEP_S * limits.acceleration, 's', limits)
         return Admitted(tuple(waypoints), None, is_straight)

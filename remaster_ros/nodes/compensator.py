@@ -268,8 +268,8 @@ class CompensatorNode(RemasterNode):
             )
         why = difference(self._chain, self._description)
         true_arm = self._correction.true_arm
-        apart = [axes_apart(arm, self._description) for arm in (true_arm, self._chain)]
-        if why and apart[0] < NEARER * apart[1]:
+        distances = [axes_apart(arm, self._description) for arm in (true_arm, self._chain)]
+        if why and distances[0] < NEARER * distances[1]:
             return (
                 f'{topic} holds this correction already: give robot_state_publisher and the '
                 'planner the nominal description, or end the compensator'
@@ -298,8 +298,8 @@ class CompensatorNode(RemasterNode):
                 'corrected twice; end one of them'
             )
         if not (self._present.is_known and self._present.is_fresh(time.monotonic())):
-            others = f' ({self._states.others})' if self._states.others else ''
-            return f'{topic} does not come{others}'
+            other_joints = f' ({self._states.others})' if self._states.others else ''
+            return f'{topic} does not come{other_joints}'
         if self.p.temperature_topic and time.monotonic() - self._warm_wall_s > WARM_S:
             topic = self.resolve_topic_name(self.p.temperature_topic)
             return f'{topic} has not come for {WARM_S:.0f} s'
@@ -507,8 +507,10 @@ class CompensatorNode(RemasterNode):
             refuse(str(error))
             return
         arm = self._present.snapshot()
-        told = arm.q + self._true.added if self._on else None
-        work = partial(self._work_out, message, arm, self._gate, self._in_use, self._warm, told)
+        planner_q = arm.q + self._true.added if self._on else None
+        work = partial(
+            self._work_out, message, arm, self._gate, self._in_use, self._warm, planner_q
+        )
 
         def take(found: Any) -> None:
             why = self._outdated(number, arm, found)
@@ -546,17 +548,17 @@ class CompensatorNode(RemasterNode):
         gate: ForeignGate,
         in_use: Any,
         warm: float | None,
-        told: FloatArray | None,
+        planner_q: FloatArray | None,
     ) -> tuple[Any, JointTrajectory]:
         """Return the corrected trajectory (`SentTrajectory`) and its message.
 
-        ``warm``: temperature, °C, or None; ``told``: the arm's angles as the planner was told,
-        rad, (k,), None with the correction off. Uses no state that callbacks change. Raises
+        ``warm``: temperature, °C, or None; ``planner_q``: the arm's angles as the planner was
+        told, rad, (k,), None with the correction off. Uses no state that callbacks change. Raises
         InputError if the trajectory is refused.
         """
         wanted = self._motion.Trajectory(*_points(message, self._names))
         passed = self._motion.corrected_for_controller(
-            wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, told
+            wanted, arm, gate, in_use, 1e-3 * self.p.tolerance_mm, warm, planner_q
         )
         return passed, self._message(passed.admitted)
 
@@ -817,7 +819,7 @@ class CompensatorNode(RemasterNode):
         self._disk.close()
         awaited = [goal.sent.cancel_goal_async() for goal in self._goals if goal.sent is not None]
         executor, end = self.executor, time.monotonic() + LAST_ANSWER_WALL_S
-        while executor is not None and not all(one.done() for one in awaited):
+        while executor is not None and not all(future.done() for future in awaited):
             if time.monotonic() > end or not self.context.ok():
                 return
             executor.spin_once(timeout_sec=0.01)

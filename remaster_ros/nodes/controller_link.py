@@ -238,10 +238,10 @@ class ActionLink:
         service = f'{self._action}/_action/send_goal'
         if self._node.count_clients(service) <= 1:
             return ''
-        own = self._node.get_name(), self._node.get_namespace()
+        own_node = self._node.get_name(), self._node.get_namespace()
         found = []
         for name, namespace in self._node.get_node_names_and_namespaces():
-            if (name, namespace) == own or name == UNNAMED:
+            if (name, namespace) == own_node or name == UNNAMED:
                 continue
             try:
                 clients = self._node.get_client_names_and_types_by_node(name, namespace)

@@ -90,7 +90,7 @@ def real_nodes(
             f'defaults; add /**/{missing[0]}'
         )
     by_sensor = {values.get('sensor'): name for name, values in sections.items()}
-    own: dict[str, Any] = {'cell': str(Path(cell).resolve())}
+    cell_values: dict[str, Any] = {'cell': str(Path(cell).resolve())}
     remappings = []
     if controller:
         remappings.append((COMMANDS, f'{controller}/joint_trajectory'))
@@ -106,20 +106,20 @@ def real_nodes(
     # The recorder does not wait for a sensor whose node is not started.
     require = {'require': wanted[0]} if len(wanted) == 1 < len(known) else {}
     values = {
-        'pose_planner': own,
-        'robot_bridge': own,
-        'recorder': {**own, **require},
-        'optimizer': own,
+        'pose_planner': cell_values,
+        'robot_bridge': cell_values,
+        'recorder': {**cell_values, **require},
+        'optimizer': cell_values,
     }
     for name, folders in FOLDERS.items():
-        beside = _beside(params, sections[name], folders)
-        values[name] = {**values.get(name, {}), **beside}
+        folder_values = _beside(params, sections[name], folders)
+        values[name] = {**values.get(name, {}), **folder_values}
     nodes = [start(name, name, **values.get(name, {})) for name in CORE]
     for sensor in wanted:
         node = by_sensor.get(sensor, '')
         if not node and known[sensor].source:
             # Nothing of its node has to be set.
-            nodes.append(start(GENERIC, f'{TOPIC}_{sensor}', **own, sensor=sensor))
+            nodes.append(start(GENERIC, f'{TOPIC}_{sensor}', **cell_values, sensor=sensor))
             continue
         kind = kind_of(node)
         if not kind:
@@ -128,9 +128,9 @@ def real_nodes(
                 f'section /**/{" or /**/".join(DRIVERS)} with "sensor: {sensor}", or leave it '
                 'out with sensors:='
             )
-        nodes.append(start(kind if kind in SENSORS else GENERIC, node, **own))
+        nodes.append(start(kind if kind in SENSORS else GENERIC, node, **cell_values))
     if _is_true('dashboard', dashboard):
-        nodes.append(start(PAGE, PAGE, **own, fit=values['optimizer']['out']))
+        nodes.append(start(PAGE, PAGE, **cell_values, fit=values['optimizer']['out']))
     return nodes
 
 

@@ -299,7 +299,7 @@ class Optimizer(RemasterNode):
         names = ', '.join(effect.name for effect in found.effects)
         names = names or ('nothing' if found.verdict == 'none' else found.verdict)
         decided = decisions(found, pairs)
-        words = [f'discovered: {names}', *(one.sentence for one in decided)]
+        words = [f'discovered: {names}', *(decision.sentence for decision in decided)]
         report = save_discovery(found, out, figures=self.p.figures, decided=decided)
         return report, '; '.join(words)
 

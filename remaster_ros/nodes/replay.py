@@ -180,11 +180,11 @@ class Replay(RemasterNode):
 
         Raises InputError: naming the node. One that was killed stays listed for some 20 s.
         """
-        own = self.get_name(), self.get_namespace()
+        own_node = self.get_name(), self.get_namespace()
         for topic in SOURCES:
             name = self.resolve_topic_name(topic)
             for info in self.get_publishers_info_by_topic(name):
-                if (info.node_name, info.node_namespace) != own:
+                if (info.node_name, info.node_namespace) != own_node:
                     raise InputError(_live(info, f'publishes {name}'))
         # Of nodes that publish a summary, recorder and laser tracker only listen to the commands.
         reporting = {
@@ -193,7 +193,7 @@ class Replay(RemasterNode):
         }
         name = self.resolve_topic_name(COMMANDS.lstrip('/'))
         for info in self.get_subscriptions_info_by_topic(name):
-            if (info.node_name, info.node_namespace) not in reporting - {own}:
+            if (info.node_name, info.node_namespace) not in reporting - {own_node}:
                 raise InputError(_live(info, f'listens to {name}'))
 
     def _look_who_listens(self, publisher: Publisher) -> None:
@@ -238,8 +238,10 @@ class Replay(RemasterNode):
                 self._refuse_live()
                 if looked - shown > SHOWN_S:
                     shown = looked
-                    left = (last - stamp_ns) * 1e-9 / self.p.rate
-                    self.get_logger().info(f'{self.sent} messages published, {left:.0f} s left')
+                    remaining_s = (last - stamp_ns) * 1e-9 / self.p.rate
+                    self.get_logger().info(
+                        f'{self.sent} messages published, {remaining_s:.0f} s left'
+                    )
             self._publish_clock(stamp_ns)
             publisher = self._publishers_by_topic.get(topic)
             if publisher is not None:
@@ -374,20 +376,22 @@ class Acknowledged:
         since = time.monotonic()
         while not ending.is_set():
             taken = self._ask(ending) or {}
-            left = {
+            remaining_counts = {
                 name: count - taken.get(name, 0) + self._before.get(name, 0)
                 for name, count in self.sent.items()
                 # It lists the topics that it takes; of records those that have come.
                 if name in taken or ' ' in name
             }
-            left = {name: count for name, count in left.items() if count > 0}
-            if not left:
+            remaining_counts = {
+                name: count for name, count in remaining_counts.items() if count > 0
+            }
+            if not remaining_counts:
                 break
-            if left != missing:
-                missing, since = left, time.monotonic()
+            if remaining_counts != missing:
+                missing, since = remaining_counts, time.monotonic()
             elif time.monotonic() - since > TAKEN_S:
                 self._before, self.sent = taken, Counter()
-                return left
+                return remaining_counts
             ending.wait(0.001)
         self._before = {
             name: self._before.get(name, 0) + self.sent[name]

@@ -662,8 +662,8 @@ class RobotBridge(RemasterNode):
         Timer callback, every `WATCH_WALL_S`.
         """
         now = self.steady_s()
-        others = (only.trouble() for only in self._only)
-        rivals = self._states.rival() or next(filter(None, others), '')
+        troubles = (only.trouble() for only in self._only)
+        rivals = self._states.rival() or next(filter(None, troubles), '')
         if self._controller is not None:
             rivals = rivals or self._controller.rival()
         self.supervisor.use_stamps(kept=self._keeps_stamps())

@@ -194,8 +194,8 @@ class NodeStatus:
         Only states of the same full name count, and only while the graph has two publishers of
         that name.
         """
-        own = self._node.get_fully_qualified_name()
-        if record.node != own or not record.started or not isinstance(record.body, STATES):
+        name = self._node.get_fully_qualified_name()
+        if record.node != name or not record.started or not isinstance(record.body, STATES):
             return
         now = time.monotonic()
         if record.started == self._started:
@@ -207,16 +207,16 @@ class NodeStatus:
         uptime_s = record.uptime_s
         if self._duplicates.update_other(record.started, uptime_s, now - self._started_wall, now):
             self._node.failure = InputError(  # type: ignore[attr-defined]
-                f'{own} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
+                f'{name} is running already in this ROS domain, for {uptime_s:.0f} s, on another '
                 'computer or for another user; end that one, or give this one a namespace '
                 '(__ns:=/…) or a domain (ROS_DOMAIN_ID) of its own'
             )
 
     def _namesakes(self) -> int:
         """Return the number of publishers of records by nodes of this name, itself included."""
-        own = self._node.get_name(), self._node.get_namespace()
+        own_node = self._node.get_name(), self._node.get_namespace()
         found = self._node.get_publishers_info_by_topic(self._events.topic_name)
-        return sum((info.node_name, info.node_namespace) == own for info in found)
+        return sum((info.node_name, info.node_namespace) == own_node for info in found)
 
     def publish(self) -> None:
         """Publish the state now, on remaster/events and remaster/status; from any thread."""
@@ -255,18 +255,18 @@ class NodeStatus:
         level, message = summary.level, summary.message
         if self._qos_trouble and level == 'ok':
             level, message = 'warn', self._qos_trouble
-        own = self._node.get_fully_qualified_name()
+        full_name = self._node.get_fully_qualified_name()
         values = {
             **pairs(summary.state),
             **summary.values,
             'qos_trouble': self._qos_trouble,
-            'node': own,
+            'node': full_name,
             'started': self._started,
             'uptime_s': f'{time.monotonic() - self._started_wall:.3f}',
         }
         name, hardware_id = self._node.get_name(), 'remaster_ros'
         if publisher is self._diagnostics:
-            name, hardware_id = f'{own.lstrip("/")}: state', self._hardware_id
+            name, hardware_id = f'{full_name.lstrip("/")}: state', self._hardware_id
         status = DiagnosticStatus(
             name=name,
             level=LEVELS[level],

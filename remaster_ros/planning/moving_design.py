@@ -242,7 +242,7 @@ class _Search:
         """Configurations in sight in one part of joint space, (n, k)."""
         sensors_R = {sensor.name: sensor.position_R for sensor in sensors}
         plan = scene_with_other_elbows(self._scene).plan(POOL_CANDIDATES, sensors_R, self._rng)
-        near = NEAR_RAD * self._chain.per_radian
+        half_width = NEAR_RAD * self._chain.per_radian
         solutions = [pose.solutions for pose in plan.poses]
         q = np.concatenate([np.empty((0, len(self._chain))), *solutions])
         q = q[self.usable(q)]
@@ -251,14 +251,16 @@ class _Search:
                 'no configuration is found in which every marker is in sight; correct '
                 'rough_position_m and max_angle_deg of the sensors, or the ranges of poses'
             )
-        neighbours = np.array([np.sum(np.all(np.abs(q - each) <= near, axis=1)) for each in q])
+        neighbours = np.array(
+            [np.sum(np.all(np.abs(q - each) <= half_width, axis=1)) for each in q]
+        )
         if before is not None:
             # Of the centres with many neighbours that to which the way is short.
             q = q[neighbours >= ENOUGH * neighbours.max()]
             neighbours = -self._travel.straight(before, q)
         centre = q[int(np.argmax(neighbours))]
-        low = np.maximum(centre - near, self._chain.lower + self._margin)
-        high = np.minimum(centre + near, self._chain.upper - self._margin)
+        low = np.maximum(centre - half_width, self._chain.lower + self._margin)
+        high = np.minimum(centre + half_width, self._chain.upper - self._margin)
         drawn = self._rng.uniform(low, high, (DRAWN, len(centre)))
         pool = np.concatenate((centre[None], drawn[self.usable(drawn)][: POOL - 1]))
         if len(pool) < FEWEST_POOL:
@@ -336,14 +338,14 @@ class _Search:
 
     def _near(self, here: FloatArray, there: FloatArray | None) -> FloatArray:
         """Draw a configuration of the pool that is some seconds from one, or from two others."""
-        some = self._rng.permutation(self._pool)[:SOME]
+        sample = self._rng.permutation(self._pool)[:SOME]
         ends = [here] if there is None else [here, there]
         # At full speed along straight lines.
-        times = np.max([self._travel.straight(each, some) - RAMP_S for each in ends], axis=0)
-        near = np.flatnonzero((times < FAR_S) & (times > NEAR_S))
-        if not len(near):
-            near = np.argsort(times)[1 : 1 + FEWEST_NEAR]
-        return some[int(self._rng.choice(near))]
+        times = np.max([self._travel.straight(each, sample) - RAMP_S for each in ends], axis=0)
+        neighbours = np.flatnonzero((times < FAR_S) & (times > NEAR_S))
+        if not len(neighbours):
+            neighbours = np.argsort(times)[1 : 1 + FEWEST_NEAR]
+        return sample[int(self._rng.choice(neighbours))]
 
     def _cost_of(self, pieces: Sequence[_Piece]) -> float:
         total = np.sum([piece.information for piece in pieces], axis=0)

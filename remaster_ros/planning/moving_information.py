@@ -173,21 +173,21 @@ class MovingInformation:
             clock = k + 6 * len(self._sensors) + 3 * len(self._names)
             for number, (name, place) in enumerate(sensor.markers.items()):
                 J = chain.position_jacobian(rows.q, place)
-                own = columns[:, number]
-                own[:, :, :k] = J
-                own[:, :, at : at + 3] = np.eye(3)
+                jac = columns[:, number]
+                jac[:, :, :k] = J
+                jac[:, :, at : at + 3] = np.eye(3)
                 arm = turn @ place + tool[:, :3, 3] - self._middle
-                own[:, :, at + 3 : at + 6] = np.cross(np.eye(3)[None], arm[:, None]).swapaxes(1, 2)
+                jac[:, :, at + 3 : at + 6] = np.cross(np.eye(3)[None], arm[:, None]).swapaxes(1, 2)
                 of_marker = k + 6 * len(self._sensors) + 3 * self._names.index(name)
-                own[:, :, of_marker : of_marker + 3] = turn
+                jac[:, :, of_marker : of_marker + 3] = turn
                 moved = np.einsum('nij,nj->ni', J, rows.velocity)
-                own[:, :, clock + 2 * index] = moved
-                own[:, :, clock + 2 * index + 1] = moved * rows.seconds[:, None]
+                jac[:, :, clock + 2 * index] = moved
+                jac[:, :, clock + 2 * index + 1] = moved * rows.seconds[:, None]
                 after = clock + 2 * len(self._sensors)
                 for values in turning:
-                    own[:, :, after : after + k] = J * values[:, None, :]
+                    jac[:, :, after : after + k] = J * values[:, None, :]
                     after += k
-                own[:, :, after:] = swing
+                jac[:, :, after:] = swing
             total += _information(columns, sensor, process, self._own_m)
         return total
 
@@ -226,17 +226,17 @@ def _information(
     frame = sensor.frame_sigma_m**2 / FRAMES_OF_ROW
     common = sensor.pose_sigma_m**2 + own_m**2 / count
     found = np.zeros((p, p))
-    for part, field, rest in (
+    for part, field, variance in (
         (mean, common, white / count + frame),
         (columns - mean[:, None], own_m**2, white),
     ):
         flat = part.reshape(n, -1)
         if field > 0.0:
-            factor = np.linalg.cholesky(field * process + rest * np.eye(n))
+            factor = np.linalg.cholesky(field * process + variance * np.eye(n))
             flat = solve_triangular(factor, flat, lower=True, check_finite=False)
-            rest = 1.0
+            variance = 1.0
         flat = flat.reshape(-1, p)
-        found += flat.T @ flat / rest
+        found += flat.T @ flat / variance
     return found
 
 
@@ -308,9 +308,9 @@ def expected_along(
         name: float(std[identifiable[joint]]) if joint in identifiable else None
         for joint, name in enumerate(chain.joint_names)
     }
-    own = slice(0, len(free))
-    flat = columns[:, :, own].reshape(-1, len(free))
-    tool_square = np.sum(covariance[own, own] * (flat.T @ flat)) / len(columns)
+    free_slice = slice(0, len(free))
+    flat = columns[:, :, free_slice].reshape(-1, len(free))
+    tool_square = np.sum(covariance[free_slice, free_slice] * (flat.T @ flat)) / len(columns)
     known = [
         value / unit
         for value, unit in zip(joint_std.values(), chain.per_radian)

@@ -180,10 +180,12 @@ class _Units:
     measuring them and of the motions between them, s, (n,).
     """
 
-    def __init__(self, information: DesignInformation, travel: TravelTime, whole: bool) -> None:
-        self.information, self.whole = information, whole
+    def __init__(
+        self, information: DesignInformation, travel: TravelTime, whole_poses: bool
+    ) -> None:
+        self.information, self.whole = information, whole_poses
         self.members = list(np.arange(len(information))[:, None])
-        if whole:
+        if whole_poses:
             self.information, self.members = information.whole_poses()
         self.solutions: IntArray = np.array([len(from_solution) for from_solution in self.members])
         self._travel, self._q = (
@@ -221,13 +223,13 @@ class _Units:
                 first + int(np.argmin(least[first : first + count]))
                 for first, count in zip(self._first, self.solutions, strict=True)
             ]
-            near = np.empty(len(ends))
+            travel_s = np.empty(len(ends))
             for start in np.unique(from_solution[ends]):
                 units_of_start = np.flatnonzero(from_solution[ends] == start)
-                near[units_of_start] = self._travel.straight(
+                travel_s[units_of_start] = self._travel.straight(
                     solutions_of_unit[start], q[np.array(ends)[units_of_start]]
                 )
-            self._near[index] = near
+            self._near[index] = travel_s
             # A unit is no neighbour of itself.
             self._near[index][index] = np.inf
         return self._near[index]
@@ -278,8 +280,8 @@ class _Search:
         """
         if not chosen:
             return self._units.stay_s
-        near = np.min([self._units.near(index) for index in chosen], axis=0)
-        return near + self._units.stay_s
+        travel_s = np.min([self._units.near(index) for index in chosen], axis=0)
+        return travel_s + self._units.stay_s
 
     def is_done(self, chosen: Sequence[int]) -> bool:
         """Whether chosen units reach goal and floors."""
@@ -379,12 +381,12 @@ class _Search:
         which = np.array(chosen, dtype=np.int64)
         without = [[kept_unit for kept_unit in chosen if kept_unit != index] for index in chosen]
         matrices = np.array([self._information.total(remaining) for remaining in without])
-        near = np.array([self._units.near(index)[which] for index in chosen])
+        travel_s = np.array([self._units.near(index)[which] for index in chosen])
         stay_s = self._units.stay_s[which]
         # A single remaining unit has no neighbour, and no travel.
-        near[~np.isfinite(near)] = np.inf if len(chosen) > 2 else 0.0
+        travel_s[~np.isfinite(travel_s)] = np.inf if len(chosen) > 2 else 0.0
         spent = [
-            np.sum(np.min(np.delete(np.delete(near, i, 0), i, 1), axis=0))
+            np.sum(np.min(np.delete(np.delete(travel_s, i, 0), i, 1), axis=0))
             for i in range(len(chosen))
         ]
         times = np.array(spent) + np.sum(stay_s) - stay_s
@@ -398,6 +400,6 @@ class _Search:
         With measuring; without travel for a single unit. ``chosen``: indices of units.
         """
         which = np.array(chosen, dtype=np.int64)
-        near = np.min([self._units.near(index)[which] for index in chosen], axis=0)
-        ways = float(np.sum(near)) if len(chosen) > 1 else 0.0
+        travel_s = np.min([self._units.near(index)[which] for index in chosen], axis=0)
+        ways = float(np.sum(travel_s)) if len(chosen) > 1 else 0.0
         return ways + float(np.sum(self._units.stay_s[which]))

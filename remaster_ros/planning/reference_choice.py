@@ -70,16 +70,16 @@ def causes(chain: SerialChain, places: Sequence[Place]) -> list[Cause]:
     def of(names: Sequence[str], name: str) -> FloatArray:
         return np.array([each == name for each in names], float)[:, None, None]
 
-    whole = rigid(points, points.mean(axis=0))
+    motion = rigid(points, points.mean(axis=0))
     changes = []
     if len(sensors) == 1:
-        changes.append(Cause('sensor', f'{sensors[0]} or the base was moved', whole, 3))
+        changes.append(Cause('sensor', f'{sensors[0]} or the base was moved', motion, 3))
     else:
         for name in sensors:
             mine = of([place.sensor for place in places], name)
             center = points[mine[:, 0, 0] > 0].mean(axis=0)
             changes.append(Cause('sensor', f'{name} was moved', mine * rigid(points, center), 3))
-        changes.append(Cause('base', 'the base, or all sensors together, were moved', whole, 3))
+        changes.append(Cause('base', 'the base, or all sensors together, were moved', motion, 3))
     for name in markers:
         mine = of([place.marker for place in places], name)
         changes.append(Cause('marker', f'marker {name} slipped on the tool', mine * turned, 3))

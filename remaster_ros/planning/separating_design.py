@@ -99,7 +99,7 @@ def scene_with_other_elbows(scene: PlanningScene) -> PlanningScene:
     chain = scene.model.chain
     margin = scene.limit_margin_rad * chain.per_radian
     low, high = chain.lower + margin, chain.upper - margin
-    held = {
+    elbows = {
         joint: sorted(
             {
                 float(np.clip(value + step, low[joint], high[joint]))
@@ -109,7 +109,7 @@ def scene_with_other_elbows(scene: PlanningScene) -> PlanningScene:
         )
         for joint, values in scene.inverse_kinematics.held.items()
     }
-    return replace(scene, inverse_kinematics=InverseKinematics(chain, held)) if held else scene
+    return replace(scene, inverse_kinematics=InverseKinematics(chain, elbows)) if elbows else scene
 
 
 def measured_so_far(rows: Measurements) -> tuple[tuple[PlannedPose, ...], MeasuredSoFar]:

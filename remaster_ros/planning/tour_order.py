@@ -452,7 +452,7 @@ def free_order(
     solutions: FloatArray,
     velocity_limits: FloatArray,
     rng: np.random.Generator,
-    one: bool = False,
+    one_solution: bool = False,
 ) -> tuple[list[int], list[FloatArray]]:
     """Return an order of joint solutions in which each can be reached from the one before.
 
@@ -461,15 +461,15 @@ def free_order(
     is tried again from each later one.
 
     ``model``: obstacles; with None every straight path is free; ``q``: start configuration, rad,
-    (k,); ``solutions``: rad, (m, k); ``velocity_limits``: rad/s, (k,); ``one``: stop after one
-    solution.
+    (k,); ``solutions``: rad, (m, k); ``velocity_limits``: rad/s, (k,); ``one_solution``: stop
+    after one solution.
     Returns indices into solutions, without unreachable ones, and for each the waypoints before it,
     rad, (n, k).
     """
     remaining = [int(i) for i in order_solutions(solutions, q, velocity_limits)]
     straight = np.empty((0, solutions.shape[1]))
     if model is None:
-        remaining = remaining[:1] if one else remaining
+        remaining = remaining[:1] if one_solution else remaining
         return remaining, [straight] * len(remaining)
     order: list[int] = []
     paths: list[FloatArray] = []
@@ -489,7 +489,7 @@ def free_order(
             break
         order.append(nearest)
         paths.append(waypoints)
-        if one:
+        if one_solution:
             break
         remaining.remove(nearest)
         position = solutions[nearest]

@@ -94,8 +94,8 @@ def registration_tour(
         for a, b, c in candidates
     ]
     best = candidates[int(np.argmax(areas))]
-    others = [i for i in range(len(plan.poses)) if i not in best]
-    poses = tuple(plan.poses[i] for i in (*best, *others))
+    other_poses = [i for i in range(len(plan.poses)) if i not in best]
+    poses = tuple(plan.poses[i] for i in (*best, *other_poses))
     ordered = Plan(poses, plan.dropped, plan.dropped_solutions)
     return Tour(chain, {REGISTRATION: ordered}, in_order=True, one_solution=True, model=model)
 
@@ -224,8 +224,8 @@ class TourPlanner:
             plans['optimization'] = self._separating(plans['optimization'], sensors_R)
         order = []
         if self.design.fastest:
-            whole = self.design.whole_poses
-            order = visit_order(plans, self.model, self.travel, whole_poses=whole)
+            whole_poses = self.design.whole_poses
+            order = visit_order(plans, self.model, self.travel, whole_poses=whole_poses)
         if self._every:
             plans[REFERENCE] = self._references(plans)
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)

@@ -88,21 +88,21 @@ def _move(times: FloatArray, order: list[int]) -> bool:
     best, move = 1e-9, None
     for size in range(1, LONGEST_MOVED + 1):
         for i in range(1, len(order) - size):
-            part, others = order[i : i + size], np.array(order[:i] + order[i + size :])
+            part, remaining = order[i : i + size], np.array(order[:i] + order[i + size :])
             previous, following = order[i - 1], order[i + size]
             saving = (
                 times[previous, part[0]] + times[part[-1], following] - times[previous, following]
             )
-            gap = times[others[:-1], others[1:]]
+            gap = times[remaining[:-1], remaining[1:]]
             for turned in (part, part[::-1]):
-                cost = times[others[:-1], turned[0]] + times[turned[-1], others[1:]] - gap
+                cost = times[remaining[:-1], turned[0]] + times[turned[-1], remaining[1:]] - gap
                 place = int(np.argmin(cost))
                 if saving - cost[place] > best:
-                    best, move = saving - cost[place], (others.tolist(), place + 1, turned)
+                    best, move = saving - cost[place], (remaining.tolist(), place + 1, turned)
     if move is None:
         return False
-    others_list, place, turned = move
-    order[:] = [*others_list[:place], *turned, *others_list[place:]]
+    remaining_list, place, turned = move
+    order[:] = [*remaining_list[:place], *turned, *remaining_list[place:]]
     return True
 
 

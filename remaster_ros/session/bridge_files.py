@@ -137,8 +137,8 @@ class LastCommandFile:
         age_s = (now_ns - kept.sent_ns) / 1e9 if now_ns >= kept.sent_ns else np.inf
         names = kept.joints == self._joints
         end, following = (
-            np.array(one) if names and one and _is_place(one, len(self._joints)) else None
-            for one in (kept.end, kept.next)
+            np.array(place) if names and place and _is_place(place, len(self._joints)) else None
+            for place in (kept.end, kept.next)
         )
         return LastCommand(end, age_s, following)
 

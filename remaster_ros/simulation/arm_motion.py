@@ -78,8 +78,8 @@ def from_now(
     if not behind or not remaining:
         return remaining, None
     last, ahead = behind[-1], points[len(behind)]
-    rest = np.zeros_like(last.q)
-    start = rest if last.velocity is None else last.velocity
+    zeros = np.zeros_like(last.q)
+    start = zeros if last.velocity is None else last.velocity
     piece = spline(last.q, start, ahead.q, ahead.velocity, ahead.time_s - last.time_s)
     powers = (since_s - last.time_s) ** np.arange(len(piece))
     slope = piece[1:] * np.arange(1, len(piece))[:, None]

@@ -91,11 +91,11 @@ class Deviation:
         per_sensor = ((s, 3), (s, 3), (s, 3), (s, 1), (s, 2), (s, 3), (s, 2))
         return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
-    def map(self, change: Callable[..., FloatArray], *others: Deviation) -> Deviation:
-        """Deviation with a function applied to each array of this one and those of `others`."""
+    def map(self, change: Callable[..., FloatArray], *operands: Deviation) -> Deviation:
+        """Deviation with a function applied to each array of this one and those of `operands`."""
         names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
         changed: dict[str, Any] = {
-            name: change(getattr(self, name), *(getattr(other, name) for other in others))
+            name: change(getattr(self, name), *(getattr(other, name) for other in operands))
             for name in names
         }
         return replace(self, **changed)

@@ -196,14 +196,14 @@ class Beam:
         ``target``: in the tracker's frame, of any length but 0, (3,); ``largest_rad``: largest
         angle from it. The beam is not locked; without a reflector the former one stays selected.
         """
-        before, near = self._on, {}
+        before, angles = self._on, {}
         for name in self._numbers:
             self._on = name
             angle = angle_between(target, self.reflector(t))
             if angle <= largest_rad and self.sees(t):
-                near[name] = angle
-        self._on = min(near, key=near.__getitem__, default=before)
-        return bool(near)
+                angles[name] = angle
+        self._on = min(angles, key=angles.__getitem__, default=before)
+        return bool(angles)
 
     def lock(self, t: float) -> None:
         """Lock on the selected reflector and aim at it, at time t, s."""

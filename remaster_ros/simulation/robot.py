@@ -68,11 +68,11 @@ class FakeArm:
         # The error is the same for all parts of one move.
         stray, self._begun_s = self._stray, start_s
         # Faults: a wrong target, or a slow motion.
-        slow, beside = faults.get('slow', 1.0), faults.get('elsewhere', 0.0) * per_radian
+        slow, offset = faults.get('slow', 1.0), faults.get('elsewhere', 0.0) * per_radian
         waypoints = [
             ServoPoint(
                 slow * point.time_s,
-                point.q[columns] + stray + beside,
+                point.q[columns] + stray + offset,
                 None if point.velocity is None else point.velocity[columns] / slow,
             )
             for point in points

@@ -331,8 +331,8 @@ def simulate_workcell(
             f'sensors {what} measure poses; state the noise of an orientation as well '
             '(--orientation-noise-deg, in Python orientation_noise_rad)'
         )
-    own = [marker for sensor in cell.sensors.values() for marker in sensor.markers]
-    if on_tool and not len(cell.sensors) == len(own) == len(set(own)):
+    marker_names = [marker for sensor in cell.sensors.values() for marker in sensor.markers]
+    if on_tool and not len(cell.sensors) == len(marker_names) == len(set(marker_names)):
         raise InputError(
             'the marker of a sensor on the tool is its own origin, and it has no other; choose '
             'such sensors (--sensors, in Python sensors)'

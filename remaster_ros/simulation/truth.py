@@ -112,14 +112,14 @@ class SessionTruth:
 
 
 def place_sensor(
-    near: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
+    place: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
 ) -> FloatArray:
     """Random T_R_N (4, 4) of a sensor near a place, with its z axis towards a point of R.
 
-    ``near, look_at``: m, in R; ``std_m``: standard deviation of the place per axis. The roll about
-    z is uniform within 0.2 rad.
+    ``place, look_at``: m, in R; ``std_m``: standard deviation of the place per axis. The roll
+    about z is uniform within 0.2 rad.
     """
-    position = np.asarray(near, float) + rng.normal(0.0, std_m, 3)
+    position = np.asarray(place, float) + rng.normal(0.0, std_m, 3)
     turn = looking_at(position, look_at, rng.uniform(-ROLL_RAD, ROLL_RAD))
     return transform(turn, position)
 

@@ -181,8 +181,8 @@ class WorldClock:
         """World time now, or at `wall_s` of the monotonic clock, s."""
         base_wall, base, limit, held_until = self._line()
         wall = time.monotonic() if wall_s is None else wall_s
-        held = min(base + (min(wall, held_until) - base_wall) * self.rate, limit)
-        return held + max(wall - held_until, 0.0) * self.rate
+        world_s = min(base + (min(wall, held_until) - base_wall) * self.rate, limit)
+        return world_s + max(wall - held_until, 0.0) * self.rate
 
     def sleep_until(self, t: float) -> None:
         """Wait until world time t.

@@ -44,7 +44,7 @@ def read(text: str) -> NamedColumns | None:
     name, opened, place, places, untaught = '', 0, False, 0, 0
     values: dict[str, str] = {}
     # Of a motion group, such as a positioner, beside that of the arm.
-    group, other, others = '', False, set[str]()
+    group, other, other_axes = '', False, set[str]()
     for number, line in enumerate(text.splitlines(), 1):
         at = 0
         while at < len(line):
@@ -64,7 +64,7 @@ def read(text: str) -> NamedColumns | None:
             elif ignored := _IGNORED.match(line, at):
                 at = ignored.end()
             elif other and (joint := _JOINT.match(line, at)):
-                others.add(joint[1])
+                other_axes.add(joint[1])
                 at = joint.end()
             elif joint := _JOINT.match(line, at):
                 if joint[1].replace('XT', '') in values or (
@@ -91,13 +91,13 @@ def read(text: str) -> NamedColumns | None:
         raise InputError(f'line {opened}: {name} does not end with }};, as is expected')
     if not found:
         raise InputError('line 1: there is no position of joints in it (P[1]{ … J1= … deg … };)')
-    return _positions('positions of a FANUC program', found, places, untaught, bool(others))
+    return _positions('positions of a FANUC program', found, places, untaught, bool(other_axes))
 
 
 def _registers(text: str) -> NamedColumns:
     """Position registers of `posreg.va` in joints, of the first motion group; raises as `read`."""
     found: list[tuple[int, str, dict[str, str]]] = []
-    places, untaught, others = set[int](), set[int](), False
+    places, untaught, has_other_groups = set[int](), set[int](), False
     values: dict[str, str] | None = None
     opened = 0
     for number, line in enumerate(text.splitlines(), 1):
@@ -111,7 +111,7 @@ def _registers(text: str) -> NamedColumns:
             if not _OF_GROUP.fullmatch(value):
                 raise unexpected(number, line, "[1,1] = '…' Group: 1")
             if register[1] != '1':
-                others, values = True, {}
+                has_other_groups, values = True, {}
             else:
                 found.append((number, f'PR[{register[2]}]', values))
             continue
@@ -122,7 +122,9 @@ def _registers(text: str) -> NamedColumns:
                     raise unexpected(number, line, "[1,1] = '…' Group: 1 before it")
                 break
             if joint := _JOINT.match(code, at):
-                if joint[1] in values or (joint[1][0] == 'J' and joint[3] != 'deg' and not others):
+                if joint[1] in values or (
+                    joint[1][0] == 'J' and joint[3] != 'deg' and not has_other_groups
+                ):
                     raise unexpected(number, line, 'each axis once, in deg,')
                 values[joint[1].replace('XT', '')] = joint[2]
                 if '*' in joint[2]:
@@ -143,7 +145,7 @@ def _registers(text: str) -> NamedColumns:
     if not found:
         raise InputError('line 1: no position register is in joints (J1 = … deg); record them so')
     return _positions(
-        'position registers of FANUC', found, len(places), len(untaught - places), others
+        'position registers of FANUC', found, len(places), len(untaught - places), has_other_groups
     )
 
 
@@ -152,16 +154,16 @@ def _positions(
     found: list[tuple[int, str, dict[str, str]]],
     places: int,
     untaught: int,
-    others: bool,
+    has_other_groups: bool,
 ) -> NamedColumns:
     """Columns of joint positions, with notes on what was left out.
 
-    `places`, `untaught`: numbers of Cartesian and untaught positions; `others`: whether there were
-    other motion groups.
+    `places`, `untaught`: numbers of Cartesian and untaught positions; `has_other_groups`: whether
+    there were other motion groups.
     """
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
     notes += (f'{untaught} positions that were never taught were left out',) * bool(untaught)
-    notes += ('the axes of other motion groups were left out',) * others
+    notes += ('the axes of other motion groups were left out',) * has_other_groups
     return axes_in_order(
         kind, found, ('J', 'E'), maker='FANUC', coupling={'J3': ('J2', 1)}, notes=notes
     )

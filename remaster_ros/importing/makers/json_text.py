@@ -82,17 +82,17 @@ class _Decoder(json.JSONDecoder):
         """Line, from 1, of a place in the text."""
         return bisect_left(self._ends, at) + 1
 
-    def _array(self, at: tuple[str, int], scan_once: Any, **rest: Any) -> Any:
+    def _array(self, at: tuple[str, int], scan_once: Any, **options: Any) -> Any:
         """Decode an array, with the line of its begin; return it and the index behind it.
 
         `at`: text and index behind the bracket.
         """
-        values, end = json.decoder.JSONArray(at, scan_once, **rest)  # type: ignore[attr-defined]
+        values, end = json.decoder.JSONArray(at, scan_once, **options)  # type: ignore[attr-defined]
         found = records.Items(values)
         found.line = self._line(at[1] - 1)
         return found, end
 
-    def _object(self, at: tuple[str, int], *args: Any, **rest: Any) -> Any:
+    def _object(self, at: tuple[str, int], *args: Any, **options: Any) -> Any:
         """Decode an object, with the line of its begin; return it and the index behind it.
 
         Raises InputError if a key is there twice.

@@ -243,18 +243,20 @@ def _moving_tracks(
         return np.array([float(cell) if cell else np.nan for cell in cells])
 
     time_s = column(1)
-    pieces = {label: np.column_stack([column(i) for i in own]) for label, own in groups.items()}
-    pieces = {label: own for label, own in pieces.items() if np.isfinite(own[:, 0]).any()}
+    pieces = {
+        label: np.column_stack([column(i) for i in piece]) for label, piece in groups.items()
+    }
+    pieces = {label: piece for label, piece in pieces.items() if np.isfinite(piece[:, 0]).any()}
     tracks: list[_Track] = []
     same = _SAME_M / LENGTHS[unit or 'm']
     for label in sorted(pieces, key=lambda name: int(np.argmax(np.isfinite(pieces[name][:, 0])))):
-        own = pieces[label]
-        distance = [track.distance(own, time_s) for track in tracks]
+        piece = pieces[label]
+        distance = [track.distance(piece, time_s) for track in tracks]
         if not distance or min(distance) > same:
             none = np.full(len(table), -1)
-            tracks.append(_Track([], np.full(own.shape, np.nan), none))
+            tracks.append(_Track([], np.full(piece.shape, np.nan), none))
             distance.append(0.0)
-        tracks[int(np.argmin(distance))].add(label, own)
+        tracks[int(np.argmin(distance))].add(label, piece)
     # What stays in its place is not on the arm.
     largest = max(track.extent() for track in tracks) if tracks else 0.0
     moving_markers = [track for track in tracks if track.extent() > _STATIC * largest]

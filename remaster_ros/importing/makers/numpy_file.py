@@ -50,9 +50,9 @@ def read(data: bytes) -> dict[str, str] | None:
         header: list[str] = []
         columns: list[list[str]] = []
         for name in names:
-            names_of, own = _columns(arrays[name], name, f'{name}: ')
+            names_of, array_columns = _columns(arrays[name], name, f'{name}: ')
             header += names_of
-            columns += own
+            columns += array_columns
         found[names[0]] = _as_text(header, columns)
     return found
 
@@ -78,9 +78,9 @@ def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], lis
     Raises InputError, beginning with `where`, for other shapes or types.
     """
     if array.dtype.names:
-        fields = [_columns(array[own], own, where) for own in array.dtype.names]
-        return [one for header, _ in fields for one in header], [
-            column for _, own in fields for column in own
+        fields = [_columns(array[field], field, where) for field in array.dtype.names]
+        return [label for header, _ in fields for label in header], [
+            column for _, field in fields for column in field
         ]
     if not 0 < array.ndim <= 3 or array.dtype.kind not in 'fiuUSM':
         raise InputError(
@@ -98,7 +98,7 @@ def _labels(name: str, width: int) -> list[str]:
     """Names of an array's columns: `name` for one, then x, y, z for three, else numbers."""
     if width == 1:
         return [name]
-    return [f'{name} {one}' for one in ('xyz' if width == 3 else range(1, width + 1))]
+    return [f'{name} {suffix}' for suffix in ('xyz' if width == 3 else range(1, width + 1))]
 
 
 def _as_text(header: list[str], columns: list[list[str]]) -> str:

@@ -66,8 +66,8 @@ def read(text: str) -> NamedColumns | None:
                     statement,
                     f'jointtarget NAME{{{array[2]}}}:=[…] of {array[2]} {_EXPECTED}',
                 )
-            for i, one in enumerate(listed, 1):
-                found.append((number, f'{array[1]}{{{i}}}', _axes(number, statement, one)))
+            for i, axes in enumerate(listed, 1):
+                found.append((number, f'{array[1]}{{{i}}}', _axes(number, statement, axes)))
             continue
         if target:
             assigned = _ASSIGNED.match(statement, target.end())

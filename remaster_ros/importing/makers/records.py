@@ -59,7 +59,7 @@ def read(kind: str, data: Any) -> NamedColumns | None:
         # A place that is null has no x, y and z.
         for key in [key for key, text in cells.items() if not text and key not in known]:
             del cells[key]
-            cells.update((own, '') for own in usual if own.startswith(f'{key} '))
+            cells.update((component, '') for component in usual if component.startswith(f'{key} '))
         if other := next((key for key in cells if key not in known), ''):
             raise unexpected(line, other, expected)
         if absent := next((key for key in usual if key not in cells), ''):
@@ -86,24 +86,28 @@ def _records(
     """
     if isinstance(data, Items):
         if _are_records(data):
-            return [(one.line or data.line, one) for one in data], names, []
-        deeper = [one for one in data if isinstance(one, (Items, Mapping))]
+            return [(item.line or data.line, item) for item in data], names, []
+        deeper = [item for item in data if isinstance(item, (Items, Mapping))]
         return _records(deeper[0], names) if len(deeper) == 1 else ([], names, [])
     if not isinstance(data, Mapping):
         return [], names, []
     if isinstance(data.get('columns'), Items) and isinstance(data.get('data'), Items):
         # As pandas writes a frame that is split.
-        header = [str(one) for one in data['columns']]
+        header = [str(item) for item in data['columns']]
         named = Items(_named(header, row) for row in data['data'] if isinstance(row, Items))
-        return [(one.line, one) for one in named], names, []
+        return [(item.line, item) for item in named], names, []
     for key in _JOINT_NAMES:
-        own = data.get(key)
-        if isinstance(own, Items) and own and all(_is_name(one) for one in own):
-            names = [str(one) for one in own]
+        joint_names = data.get(key)
+        if (
+            isinstance(joint_names, Items)
+            and joint_names
+            and all(_is_name(item) for item in joint_names)
+        ):
+            names = [str(item) for item in joint_names]
             break
     else:
         key = ''
-    mappings = data and all(isinstance(one, Mapping) for one in data.values())
+    mappings = data and all(isinstance(item, Mapping) for item in data.values())
     if mappings and (found := _records_by_key(data)):
         return found, names, []
     columns = {
@@ -120,9 +124,9 @@ def _records(
         if (
             len(chosen) == 1
             and _are_records(only := next(iter(chosen.values())))
-            and all(isinstance(one, Mapping) for one in only)
+            and all(isinstance(item, Mapping) for item in only)
         ):
-            return [(one.line, one) for one in only], names, dropped_keys
+            return [(item.line, item) for item in only], names, dropped_keys
         rows = [Mapping(zip(chosen, values)) for values in zip(*chosen.values())]
         for i, row in enumerate(rows):
             lines = [getattr(value[i], 'line', 0) for value in chosen.values()]
@@ -143,7 +147,7 @@ def _weight(columns: dict[str, Items], size: int) -> int:
 
 def _are_records(data: Items) -> bool:
     """Whether a list holds at least two records, all of them mappings or all lists."""
-    kinds = {type(one) for one in data}
+    kinds = {type(item) for item in data}
     return len(data) >= _FEWEST_RECORDS and kinds in ({Mapping}, {Items})
 
 
@@ -161,22 +165,25 @@ def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
 
     With their lines; [] if the mappings in `data` do not have equal keys, or are points.
     """
-    inner = [tuple(one) for one in data.values()]
+    inner = [tuple(mapping) for mapping in data.values()]
     if len({*inner}) != 1 or any(
-        isinstance(cell, (Items, Mapping)) for one in data.values() for cell in one.values()
+        isinstance(cell, (Items, Mapping))
+        for mapping in data.values()
+        for cell in mapping.values()
     ):
         # Of records that have names.
-        shapes = {frozenset(one) for one in data.values()}
+        shapes = {frozenset(mapping) for mapping in data.values()}
         if len(data) < _FEWEST_RECORDS or len(shapes) != 1 or {*shapes.pop()} <= {*'xyzw'}:
             return []
-        return [(one.line, _with_name(key, one)) for key, one in data.items()]
+        return [(mapping.line, _with_name(key, mapping)) for key, mapping in data.items()]
     if {*inner[0]} <= {*'xyzw'}:
         return []
     if all(key.isdigit() for key in inner[0]):
         return [
-            (data.line, Mapping({key: one[row] for key, one in data.items()})) for row in inner[0]
+            (data.line, Mapping({key: mapping[row] for key, mapping in data.items()}))
+            for row in inner[0]
         ]
-    return [(one.line, _with_name(key, one)) for key, one in data.items()]
+    return [(mapping.line, _with_name(key, mapping)) for key, mapping in data.items()]
 
 
 def _with_name(key: str, record: Mapping) -> Mapping:
@@ -205,17 +212,17 @@ def _cells(
             for label, number in zip(_OF_A_POSE, pose):
                 yield f'{name} {label}'.strip(), repr(number)
             return
-        if not all(_is_scalar_number(one) for one in flat):
+        if not all(_is_scalar_number(item) for item in flat):
             # Names and the like that a record has itself.
-            for i, one in enumerate(value, 1):
-                yield from _cells(f'{name} {i}'.strip(), one, names, depth + 1, line)
+            for i, item in enumerate(value, 1):
+                yield from _cells(f'{name} {i}'.strip(), item, names, depth + 1, line)
             return
         if len(names) == len(flat) and len(flat) != len('xyz'):
             labels: Sequence[Any] = names
         else:
             labels = 'xyz' if len(flat) == len('xyz') else range(1, len(flat) + 1)
-        for label, one in zip(labels, flat):
-            yield f'{name} {label}'.strip(), _text(one)
+        for label, item in zip(labels, flat):
+            yield f'{name} {label}'.strip(), _text(item)
     else:
         yield name, _text(value)
 
@@ -227,9 +234,9 @@ def _of_mapping(
 
     A list of joint names in it labels the lists of numbers.
     """
-    for whole, part in _SECONDS:
-        if {*value} == {whole, part} and all(str(one).isdigit() for one in value.values()):
-            yield f'{name} [s]', f'{value[whole]}.{value[part]:0>9}'
+    for seconds, part in _SECONDS:
+        if {*value} == {seconds, part} and all(str(item).isdigit() for item in value.values()):
+            yield f'{name} [s]', f'{value[seconds]}.{value[part]:0>9}'
             return
     keyed = next(
         (
@@ -237,19 +244,19 @@ def _of_mapping(
             for key in _JOINT_NAMES
             if isinstance(value.get(key), Items)
             and value[key]
-            and all(_is_name(one) for one in value[key])
+            and all(_is_name(item) for item in value[key])
         ),
         '',
     )
-    joint_names = [str(one) for one in value[keyed]] if keyed else names
-    for key, one in value.items():
+    joint_names = [str(item) for item in value[keyed]] if keyed else names
+    for key, item in value.items():
         if key != keyed:
-            yield from _cells(f'{name} {key}'.strip(), one, joint_names, depth + 1, line)
+            yield from _cells(f'{name} {key}'.strip(), item, joint_names, depth + 1, line)
 
 
 def _pose(cells: Sequence[Any]) -> list[float]:
     """Position and quaternion x, y, z, w of sixteen numbers; [] if they are no pose."""
-    if not all(NUMBER.fullmatch(str(one)) for one in cells):
+    if not all(NUMBER.fullmatch(str(cell)) for cell in cells):
         return []
     T = rigid(np.array(cells, float))
     return [] if T is None else [*map(float, (*T[0, :3, 3], *quaternion_xyzw(T[0, :3, :3])))]
@@ -257,11 +264,11 @@ def _pose(cells: Sequence[Any]) -> list[float]:
 
 def _flat(value: Items) -> Iterator[Any]:
     """Yield the scalars of nested lists."""
-    for one in value:
-        if isinstance(one, Items):
-            yield from _flat(one)
+    for item in value:
+        if isinstance(item, Items):
+            yield from _flat(item)
         else:
-            yield one
+            yield item
 
 
 def _is_scalar_number(value: Any) -> bool:

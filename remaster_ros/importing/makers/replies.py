@@ -40,9 +40,9 @@ def read(text: str) -> NamedColumns | None:
     seen = [line for _, line in lines[:_SEEN]]
     timed = [line[match.end() :] for line in seen if (match := _TIME.match(line))]
     if 2 * len(timed) <= len(seen) or not any(
-        (reply := _REPLY.fullmatch(rest.strip()))
+        (reply := _REPLY.fullmatch(reply_text.strip()))
         and (reply['state'] or reply['code'] or '(' in reply['after'])
-        for rest in timed
+        for reply_text in timed
     ):
         # A log of lists.
         return None
@@ -51,11 +51,11 @@ def read(text: str) -> NamedColumns | None:
     failed: list[str] = []
     for number, line in lines:
         time = _TIME.match(line)
-        rest = line[time.end() :].strip() if time else line.strip()
-        reply = _REPLY.fullmatch(rest)
+        reply_text = line[time.end() :].strip() if time else line.strip()
+        reply = _REPLY.fullmatch(reply_text)
         cells = _SPLIT.split(reply['list'].strip()) if reply and reply['list'].strip() else []
         if reply is None or not time or len(cells) < _FEWEST:
-            if len(_DIGITS.findall(rest)) >= _FEWEST:
+            if len(_DIGITS.findall(reply_text)) >= _FEWEST:
                 raise unexpected(number, line, 'a time and a list of numbers in brackets')
             (failed if reply and reply['state'] not in (None, '0') else other_lines).append(
                 str(number)

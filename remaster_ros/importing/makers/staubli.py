@@ -37,11 +37,11 @@ def read(text: str) -> NamedColumns | None:
         joints = {key.upper(): cell for key, cell in attributes.items() if _JOINT.fullmatch(key)}
         if not joints:
             continue
-        others = _ATTRIBUTE.sub('', tag[0].partition(' ')[2]).strip(' \t\r\n/>')
+        other_text = _ATTRIBUTE.sub('', tag[0].partition(' ')[2]).strip(' \t\r\n/>')
         names = [match[1] for match in _ATTRIBUTE.finditer(tag[0])]
         # A joint that is not written is at 0: nothing else may stand there.
         if (
-            others
+            other_text
             or len({*names}) < len(names)
             or not {*names} <= {*_KNOWN, *map(str.lower, joints)}
         ):

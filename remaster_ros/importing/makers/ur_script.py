@@ -42,8 +42,8 @@ def read(text: str) -> NamedColumns | None:
     places = 0
     for number, line in _whole_lists(text):
         if len(_SIX.findall(line)) > 1 and (several := _SEVERAL.fullmatch(line)):
-            for i, one in enumerate(_LIST.finditer(several[2])):
-                found.append((number, f'{several[1]}[{i}]', _joints(number, line, one[1])))
+            for i, joint_list in enumerate(_LIST.finditer(several[2])):
+                found.append((number, f'{several[1]}[{i}]', _joints(number, line, joint_list[1])))
             defined.add(several[1])
             continue
         if len(_SIX.findall(line)) > 1:

@@ -99,7 +99,7 @@ def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
 
 def _each(element: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
     """Elements of a name in any namespace, at any depth: strict workbooks have another one."""
-    return (one for one in element.iter() if _name(one) == name)
+    return (node for node in element.iter() if _name(node) == name)
 
 
 def _name(element: ElementTree.Element) -> str:
@@ -110,21 +110,23 @@ def _name(element: ElementTree.Element) -> str:
 def _text_of(element: ElementTree.Element) -> str:
     """Text of a cell or string, without phonetic hints."""
     texts = []
-    for one in element:
-        if _name(one) == 't':
-            texts.append(one.text or '')
-        elif _name(one) == 'r':
-            texts += [part.text or '' for part in one if _name(part) == 't']
+    for child in element:
+        if _name(child) == 't':
+            texts.append(child.text or '')
+        elif _name(child) == 'r':
+            texts += [part.text or '' for part in child if _name(part) == 't']
     return ''.join(texts)
 
 
 def _date_styles(styles: ElementTree.Element) -> list[bool]:
     """Whether each cell style, by its number from 0, shows a date or a time."""
     custom_formats = {
-        one.get('numFmtId'): bool(
-            re.search('[ymdhs]', _NOT_LETTERS.sub('', one.get('formatCode', '')), re.IGNORECASE)
+        number_format.get('numFmtId'): bool(
+            re.search(
+                '[ymdhs]', _NOT_LETTERS.sub('', number_format.get('formatCode', '')), re.IGNORECASE
+            )
         )
-        for one in _each(styles, 'numFmt')
+        for number_format in _each(styles, 'numFmt')
     }
     of_cells = next(_each(styles, 'cellXfs'), ())
     ids = [style.get('numFmtId', '0') for style in of_cells]
@@ -155,13 +157,13 @@ def _grid(
             if not (0 < row_at <= _MOST_ROWS and column <= _MOST_COLUMNS):
                 raise InputError(f'cell {cell.get("r")}: a sheet of Excel ends before it')
             kind = cell.get('t', 'n')
-            value = next((one.text or '' for one in cell if _name(one) == 'v'), '')
+            value = next((child.text or '' for child in cell if _name(child) == 'v'), '')
             if kind == 's':
                 if not (value.isdigit() and int(value) < len(shared)):
                     raise InputError(f'cell {cell.get("r")}: {value!r} is no string of this book')
                 text = shared[int(value)]
             elif kind == 'inlineStr':
-                text = ''.join(_text_of(one) for one in cell if _name(one) == 'is')
+                text = ''.join(_text_of(child) for child in cell if _name(child) == 'is')
             elif kind == 'e':
                 text = 'nan'
             elif kind == 'n':

@@ -49,7 +49,7 @@ def read(text: str) -> NamedColumns | None:
     except (yaml.YAMLError, RecursionError) as error:
         what = ' '.join(str(error).split())[:60]
         raise InputError(f'line 1: no YAML that can be read ({what})') from None
-    documents = [one for one in documents if one not in ('', 'null')]
+    documents = [document for document in documents if document not in ('', 'null')]
     data: Any = records.Items(documents)
     found = records.read('YAML', data[0] if len(documents) == 1 else data)
     if found is None:
@@ -77,7 +77,7 @@ def _plain(node: yaml.Node | None, budget: list[int], depth: int) -> Any:
         none = node.tag == 'tag:yaml.org,2002:null'
         return 'nothing' if none and not node.value else 'null' if none else node.value
     if isinstance(node, yaml.SequenceNode):
-        items = records.Items(_plain(one, budget, depth + 1) for one in node.value)
+        items = records.Items(_plain(item, budget, depth + 1) for item in node.value)
         items.line = line
         return items
     mapping = records.Mapping()

@@ -500,11 +500,11 @@ def _decode_reply(body: bytes) -> Event:
         command = Command(code)
     except ValueError:
         return UnknownPacket(DataType.COMMAND, body)
-    rest = body[_COMMAND_AND_STATUS.size :]
-    if status and not rest:
+    payload = body[_COMMAND_AND_STATUS.size :]
+    if status and not payload:
         # Instruments may leave out the values of a failed reply, or send zeros.
         return Reply(command, status)
-    values = _unpack(command.reply, rest, f'{command.name} reply')
+    values = _unpack(command.reply, payload, f'{command.name} reply')
     return Reply(command, status, () if status else values)
 
 

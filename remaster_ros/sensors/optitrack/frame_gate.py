@@ -136,8 +136,8 @@ class SourceLock:
         if not self._answered:
             return SourceVerdict.PROBATION
         known = self._note(source, now_s)
-        alone = len(self._candidates(now_s)) == 1
-        if not alone or known.frames < PROBATION_FRAMES or now_s - known.first_s < PROBATION_S:
+        is_single = len(self._candidates(now_s)) == 1
+        if not is_single or known.frames < PROBATION_FRAMES or now_s - known.first_s < PROBATION_S:
             return SourceVerdict.PROBATION
         del self._others[source]
         self.source = self._last = source
@@ -483,8 +483,8 @@ class MarkerGate:
 
 def _implausible(reading: MarkerSample) -> Dropped | None:
     """`Dropped.IMPLAUSIBLE` beyond `FARTHEST_M` or older than `MAX_AGE_S`; else None."""
-    near = np.max(np.abs(reading.position)) <= FARTHEST_M
-    return None if near and reading.age_s <= MAX_AGE_S else Dropped.IMPLAUSIBLE
+    is_in_range = np.max(np.abs(reading.position)) <= FARTHEST_M
+    return None if is_in_range and reading.age_s <= MAX_AGE_S else Dropped.IMPLAUSIBLE
 
 
 def _sample(

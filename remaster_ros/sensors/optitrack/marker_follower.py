@@ -227,11 +227,11 @@ def _refused(status: StreamStatus) -> str:
 
 def warning(status: StreamStatus) -> str:
     """Text on other programs that send frames while readings come; '' if none does."""
-    others = [*status.rivals, *status.foreign]
-    if not others or not status.source:
+    senders = [*status.rivals, *status.foreign]
+    if not senders or not status.source:
         return ''
     return (
-        f'frames also come from {", ".join(others)} and are refused; those of {status.source} '
+        f'frames also come from {", ".join(senders)} and are refused; those of {status.source} '
         f'are believed: stop the other program'
     )
 

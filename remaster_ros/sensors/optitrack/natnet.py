@@ -472,8 +472,8 @@ def decode_frame(payload: bytes, version: Version) -> Frame:
             frame[name] = codec.read(reader)
         else:
             codec.skip(reader)
-    *rest, tag = reader.unpack(layout.rest)
-    frame.update(zip(layout.rest_names, rest))
+    *values, tag = reader.unpack(layout.rest)
+    frame.update(zip(layout.rest_names, values))
     if tag != 0 or reader.remaining_bytes:
         raise ProtocolError(
             f'frame {frame["number"]} does not end where it should '
@@ -492,8 +492,8 @@ def encode_frame(frame: Frame, version: Version) -> bytes:
     require_supported(version)
     layout = _layout(min(version, NEWEST_VERSION))
     sections = [codec.write(getattr(frame, name)) for name, codec in layout.sections.items()]
-    rest = [getattr(frame, name) for name in layout.rest_names]
-    return b''.join((I32.write(frame.number), *sections, layout.rest.pack(*rest, 0)))
+    values = [getattr(frame, name) for name in layout.rest_names]
+    return b''.join((I32.write(frame.number), *sections, layout.rest.pack(*values, 0)))
 
 
 class _Layout(NamedTuple):
@@ -525,14 +525,14 @@ def _layout(version: Version) -> _Layout:
         sections['force_plates'] = section(analog)
     if version >= (2, 11):
         sections['devices'] = section(analog)
-    rest = {} if since_3 else {'software_latency': 'f'}
+    formats = {} if since_3 else {'software_latency': 'f'}
     timecode = precise_time = '8x'
-    rest['timestamp'] = timecode + ('d' if version >= (2, 7) else 'f')
+    formats['timestamp'] = timecode + ('d' if version >= (2, 7) else 'f')
     if since_3:
-        rest |= {'mid_exposure': 'Q', 'data_received': 'Q', 'transmitted': 'Q'}
-    rest['params'] = (precise_time if since_4_1 else '') + 'H'
+        formats |= {'mid_exposure': 'Q', 'data_received': 'Q', 'transmitted': 'Q'}
+    formats['params'] = (precise_time if since_4_1 else '') + 'H'
     end_tag = 'i'
-    return _Layout(sections, tuple(rest), Struct('<' + ''.join(rest.values()) + end_tag))
+    return _Layout(sections, tuple(formats), Struct('<' + ''.join(formats.values()) + end_tag))
 
 
 def _require_finite(values: Iterable[float], what: str) -> None:
@@ -754,9 +754,9 @@ def _rigid_body(version: Version) -> Record:
     if version >= (4, 0):
         columns.append(TEXT)
 
-    def build(name: str, ids_and_offset: tuple, *rest: tuple) -> RigidBodyDescription:
-        rotation = rest[0] if has_rotation else _IDENTITY
-        markers = rest[-1] if has_markers else ()
+    def build(name: str, ids_and_offset: tuple, *fields: tuple) -> RigidBodyDescription:
+        rotation = fields[0] if has_rotation else _IDENTITY
+        markers = fields[-1] if has_markers else ()
         body_id, parent_id, *offset = ids_and_offset
         return RigidBodyDescription(name, body_id, parent_id, tuple(offset), rotation, *markers)
 

@@ -74,7 +74,7 @@ def rail_advice(before: Sequence[str], base_link: str) -> str:
 def cell_text(p: CellProposal) -> str:
     """Return the YAML text of a cell file, with a comment on every key that needs a check."""
     chain, ranges = p.chain, p.ranges
-    others = ', '.join(tip for tip in p.tips if tip != chain.tip_link)
+    other_tips = ', '.join(tip for tip in p.tips if tip != chain.tip_link)
     limits = ', '.join(
         f'{name} {chain.shown_limits(joint)}{" mm" if chain.slides[joint] else ""}'
         for joint, name in enumerate(chain.joint_names)
@@ -89,7 +89,7 @@ def cell_text(p: CellProposal) -> str:
         '',
         *_comment(
             'The markers are in the frame of tip_link; its Z axis faces the sensor.'
-            + (f' Other links behind the last joint: {others}.' if others else '')
+            + (f' Other links behind the last joint: {other_tips}.' if other_tips else '')
         ),
         *_comment(f'Joints between base_link and tip_link, limits in degrees: {limits}.'),
         *(_comment(rail_advice(p.before, chain.base_link) + '.') if p.before else []),
@@ -157,26 +157,33 @@ def cell_text(p: CellProposal) -> str:
 
 def _held_lines(p: CellProposal) -> list[str]:
     """Return the lines of the held joint: its name, values and reason; '' if none is held."""
-    held, chain = p.held, p.chain
-    if held.joint is None:
-        text = f'no joint is held. A pose has {held.solutions:.1f} joint solutions on average.'
-        how = held.kinematics.in_words()
+    held_joint, chain = p.held, p.chain
+    if held_joint.joint is None:
+        text = (
+            f'no joint is held. A pose has {held_joint.solutions:.1f} joint solutions on average.'
+        )
+        how = held_joint.kinematics.in_words()
         count = {3: 'Three', 4: 'Four', 5: 'Five'}.get(len(chain), 'Six')
         return [*_comment(f'{count} joints: {text} {how}'), "held_joint: ''"]
     tried = ', '.join(
         f'{name} {count:.1f}' if isinstance(count, float) else f'{name} none ({count})'
-        for name, count in held.tried.items()
+        for name, count in held_joint.tried.items()
     )
-    values = f'held_values_deg: [{", ".join(f"{np.degrees(v):.1f}" for v in held.values_held)}]'
-    if chain.slides[held.joint]:
-        values = f'held_values_m: [{", ".join(f"{value:.3f}" for value in held.values_held)}]'
+    values = (
+        f'held_values_deg: [{", ".join(f"{np.degrees(v):.1f}" for v in held_joint.values_held)}]'
+    )
+    if chain.slides[held_joint.joint]:
+        values = (
+            f'held_values_m: [{", ".join(f"{value:.3f}" for value in held_joint.values_held)}]'
+        )
     return [
         *_comment(
             'Seven joints leave one free: this one is held, which gives poses the most joint '
             f'solutions. Tried, solutions of a pose on average: {tried}. Several values give more '
-            'poses, and determine the offset of this joint better. ' + held.kinematics.in_words()
+            'poses, and determine the offset of this joint better. '
+            + held_joint.kinematics.in_words()
         ),
-        f'held_joint: {_value(chain.joint_names[held.joint])}',
+        f'held_joint: {_value(chain.joint_names[held_joint.joint])}',
         values,
     ]
 

@@ -65,11 +65,11 @@ def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
     candidates: list[Path] = []
     if name.startswith('package://'):
         inside = unquote(name.removeprefix('package://'))
-        package, _, rest = inside.partition('/')
+        package, _, relative_path = inside.partition('/')
         folder = find_package(package, urdf, mesh_path)
         if folder is not None:
             files.add(folder)
-            candidates.append(folder / rest)
+            candidates.append(folder / relative_path)
         folders += [*sourced(), *urdf.resolve().parents]
     elif '://' in name and not name.startswith('file://'):
         raise InputError(f'{urdf}: the mesh {name} cannot be fetched; name a package:// or a file')

@@ -243,17 +243,17 @@ def _bounded(value: Any) -> Any:
     return value
 
 
-def _count(value: Any, left: int) -> int:
+def _count(value: Any, budget: int) -> int:
     """Return the number of items left of a limit after a value; raise ExpressionError below 0."""
-    if left < 0:
+    if budget < 0:
         raise ExpressionError('a text or list that is too long')
     if isinstance(value, dict):
         for item in dict.values(value):
-            left = _count(item, left - 1)
+            budget = _count(item, budget - 1)
     elif isinstance(value, list | tuple):
         for item in list.__iter__(value) if isinstance(value, list) else value:
-            left = _count(item, left - 1)
-    return left
+            budget = _count(item, budget - 1)
+    return budget
 
 
 def _length(value: Any) -> int:
@@ -279,8 +279,8 @@ def _times(left: Any, right: Any) -> Any:
 def _power(left: Any, right: Any) -> Any:
     """Return left ** right; ExpressionError for no numbers, or over `MOST_BITS` bits."""
     base, exponent = _number(left), _number(right)
-    whole = isinstance(base, int) and isinstance(exponent, int)
-    if whole and _length(base) * abs(exponent) > MOST_BITS:
+    are_integers = isinstance(base, int) and isinstance(exponent, int)
+    if are_integers and _length(base) * abs(exponent) > MOST_BITS:
         raise ExpressionError('a number that is too large')
     return base**exponent
 

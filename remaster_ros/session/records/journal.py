@@ -48,12 +48,12 @@ class Journal:
         try:
             self._lock()
             # All records so far, and the bytes of their lines.
-            self.records, whole, torn = read_journal(path)
-            self.content = bytearray(whole)
+            self.records, content, torn = read_journal(path)
+            self.content = bytearray(content)
             # What was removed from the end, in one line; '' for nothing.
             self.lost = ''
             if torn:
-                self._file.truncate(len(whole))
+                self._file.truncate(len(content))
                 self.lost = (
                     f'{path}, line {len(self.records) + 1}: {torn} bytes of a line cut off while '
                     'being written are dropped'

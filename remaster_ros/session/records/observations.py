@@ -472,7 +472,7 @@ def observations_of(
             return repeat(None, len(m))
         return (value if value >= 0 else None for value in values.tolist())
 
-    corrections = (None if one is None else bool(one) for one in counts(m.correction))
+    corrections = (None if flag is None else bool(flag) for flag in counts(m.correction))
     return map(
         Observation,
         *(m.observation.tolist(), m.pose.tolist(), m.configuration.tolist()),

@@ -287,12 +287,12 @@ def _problem(header: SessionHeader) -> str:
                 )
     for sensor in header.on_tool:
         entry = header.sensors[sensor]
-        others = [
+        other_sensors = [
             other
             for other, its in header.sensors.items()
             if other != sensor and entry.marker in (its.marker, *its.further_markers)
         ]
-        if entry.further_markers or others:
+        if entry.further_markers or other_sensors:
             return (
                 f'sensors.{sensor}: of a sensor on the tool the marker is its own origin there; '
                 f'give it one of its own, which no other sensor has'

@@ -29,8 +29,8 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
     end in ``_2``; a power of ten is added to the numbers of its observations.
     Raises InputError if sessions are of different robots, or one is given twice.
     """
-    (first_name, first), *others = sessions
-    for index, (name, session) in enumerate(others):
+    (first_name, first), *later_sessions = sessions
+    for index, (name, session) in enumerate(later_sessions):
         _require_same_arm(first_name, first, name, session)
         for earlier_name, earlier in sessions[: index + 1]:
             if session.observations_sha256 and (
@@ -48,7 +48,7 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
     frames = _next_frame(first.measurements)
     stamp = _last_stamp(first)
     lines = []
-    for number, (name, session) in enumerate(others, start=2):
+    for number, (name, session) in enumerate(later_sessions, start=2):
         names = _renamed(session, joined, number)
         lines.append(
             f'{name}: its sensors and markers are {", ".join(names.values())}, its observation 1 '
@@ -73,44 +73,44 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
             joined,
             sensors={
                 **joined.sensors,
-                **{names[one]: names[marker] for one, marker in session.sensors.items()},
+                **{names[key]: names[marker] for key, marker in session.sensors.items()},
             },
-            markers={**joined.markers, **{names[one]: at for one, at in session.markers.items()}},
+            markers={**joined.markers, **{names[key]: at for key, at in session.markers.items()}},
             further_markers={
                 **joined.further_markers,
                 **{
-                    names[one]: tuple(names[marker] for marker in further)
-                    for one, further in session.further_markers.items()
+                    names[key]: tuple(names[marker] for marker in further)
+                    for key, further in session.further_markers.items()
                 },
             },
             base_prior={
                 **joined.base_prior,
-                **{names[one]: prior for one, prior in session.base_prior.items()},
+                **{names[key]: prior for key, prior in session.base_prior.items()},
             },
             sensor_kinds={
                 **joined.sensor_kinds,
-                **{names[one]: kind for one, kind in session.sensor_kinds.items()},
+                **{names[key]: kind for key, kind in session.sensor_kinds.items()},
             },
-            on_tool=joined.on_tool | {names[one] for one in session.on_tool},
+            on_tool=joined.on_tool | {names[key] for key in session.on_tool},
             clock_offset_s={
                 **joined.clock_offset_s,
-                **{names[one]: offset for one, offset in session.clock_offset_s.items()},
+                **{names[key]: offset for key, offset in session.clock_offset_s.items()},
             },
-            oriented=joined.oriented | {names[one] for one in session.oriented},
+            oriented=joined.oriented | {names[key] for key in session.oriented},
             # The less is known of any marker, the less is said of each.
             marker_std_m=max(joined.marker_std_m, session.marker_std_m),
             settle_s=joined.settle_s if joined.settle_s == session.settle_s else None,
             notes='; '.join(note for note in (joined.notes, session.notes) if note),
         )
     given = [part for part in references if part is not None]
-    whole = replace(
+    joint_session = replace(
         joined,
         timed=timed,
         measurements=stacked(rows),
         references=stacked(given) if given else None,
         observations_sha256='',
     )
-    return whole, lines
+    return joint_session, lines
 
 
 def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], list[str]]:
@@ -145,30 +145,30 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
             silent.append(f'{name} alone does not tell whether it is of the same arm: {error}')
     for name, other in found[1:]:
         first_name, first = found[0]
-        apart = offset_differences(first, other)
-        if apart is None:
+        delta = offset_differences(first, other)
+        if delta is None:
             silent.append(
                 f'{first_name} and {name} determine no offset in common, which would tell '
                 'whether they are of one arm'
             )
-        elif apart.mostly:
+        elif delta.mostly:
             raise InputError(
-                f'{first_name} and {name} are not of one arm as it was: {_words(apart)}. Fit them '
+                f'{first_name} and {name} are not of one arm as it was: {_words(delta)}. Fit them '
                 'one by one, or together those sessions that were measured with one arm since it '
                 'was mastered last'
             )
-        elif apart.differ:
+        elif delta.differ:
             differing.append(
-                f'{first_name} and {name} do not have the same zero-offsets: {_words(apart)}. '
+                f'{first_name} and {name} do not have the same zero-offsets: {_words(delta)}. '
                 'Together they give neither: fit them one by one, and find out what was changed '
                 'between them (a motor, a mastering, another arm).'
             )
     return differing, silent
 
 
-def _words(apart: OffsetDifferences) -> str:
+def _words(differences: OffsetDifferences) -> str:
     """Return the joints whose zero-offsets differ between two sessions, as a clause."""
-    return f'fitted one by one their zero-offsets differ, {apart.words}'
+    return f'fitted one by one their zero-offsets differ, {differences.words}'
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
@@ -183,20 +183,20 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
         for given in (first, session)
     ]
     if inside[0] != inside[1]:
-        states = ' and '.join(f'{one!r}' if one else 'none' for one in inside)
+        states = ' and '.join(f'{text!r}' if text else 'none' for text in inside)
         raise InputError(
             f'{first_name} and {name} were measured with different corrections in the controller '
             f'({states}), so that their reported angles mean different things: fit them one by one'
         )
-    for what, one, other in (
+    for what, text, other in (
         ('URDF', first.urdf_sha256[:12], session.urdf_sha256[:12]),
         ('base link', first.base_link, session.base_link),
         ('tip link', first.tip_link, session.tip_link),
         ('serial number', first.serial_number, session.serial_number),
     ):
-        if one and other and one != other:
+        if text and other and text != other:
             raise InputError(
-                f'{first_name} and {name} are not of one arm: their {what} is {one} and {other}. '
+                f'{first_name} and {name} are not of one arm: their {what} is {text} and {other}. '
                 'Fit them one by one, or import both with the same description'
             )
 
