@@ -217,9 +217,11 @@ class Campaign:
         kinds = self.injections or INJECTIONS + WITH_TOPIC + WITHOUT_TOPIC
         weights = np.array([kind.weight for kind in kinds])
         shares = weights / weights.sum() * count
-        whole = [kind for kind, share in zip(kinds, shares) for _ in range(int(share))]
-        rest = self.rng.choice(len(kinds), count - len(whole), p=weights / weights.sum())
-        drawn = [*whole, *(kinds[i] for i in rest)]
+        fixed_kinds = [kind for kind, share in zip(kinds, shares) for _ in range(int(share))]
+        extra_indices = self.rng.choice(
+            len(kinds), count - len(fixed_kinds), p=weights / weights.sum()
+        )
+        drawn = [*fixed_kinds, *(kinds[i] for i in extra_indices)]
         self.rng.shuffle(drawn)  # type: ignore[arg-type]
         # Another bridge is started for the other half.
         return sorted(drawn, key=lambda kind: kind.topic is False)
@@ -267,10 +269,10 @@ class Campaign:
             goals, outcome.moved = self._begin(bench)
         settled = len(bench.seen.settled)
         newest = bench.commands_since(began)
-        left = max(newest[-1].end_s - time.monotonic(), 0.0) if newest else 0.0
-        scene = Scene(bench, self.body, rng, goals, left)
+        remaining_s = max(newest[-1].end_s - time.monotonic(), 0.0) if newest else 0.0
+        scene = Scene(bench, self.body, rng, goals, remaining_s)
         if outcome.moved:
-            scene.left_s -= scene.wait(0.0, CURVE_S if self.curves else 0.55 * left)
+            scene.left_s -= scene.wait(0.0, CURVE_S if self.curves else 0.55 * remaining_s)
             self._act(kind, scene, outcome, settled)
         else:
             # Why not, in the bridge's own words.

@@ -108,7 +108,7 @@ def natnet_seeds(version: natnet.Version | None = None) -> list[bytes]:
         ]
         seeds += [natnet.encode_message(message, spoken) for message in messages]
         seeds.append(skeleton_definition(spoken))
-    others: list[natnet.Message] = [
+    other_messages: list[natnet.Message] = [
         natnet.Response(b'Bitstream,4.1\0'),
         natnet.Response(bytes(4)),
         natnet.MessageString('hello'),
@@ -116,7 +116,7 @@ def natnet_seeds(version: natnet.Version | None = None) -> list[bytes]:
         natnet.Notice(natnet.MessageId.UNRECOGNIZED_REQUEST),
         natnet.Notice(natnet.MessageId.DISCONNECT_BY_TIMEOUT),
     ]
-    seeds += [natnet.encode_message(message, (4, 3)) for message in others]
+    seeds += [natnet.encode_message(message, (4, 3)) for message in other_messages]
     seeds.append(natnet.encode_connect_request('remaster_ros', (4, 1)))
     seeds.append(natnet.encode_command_request('Bitstream,4.1'))
     return seeds
@@ -284,8 +284,10 @@ def natnet_mutator(
     `more` joins the valid ones.
     """
     seeds = natnet_seeds()
-    own = natnet_seeds(version)
-    return Mutator([*seeds, *own * (len(seeds) // len(own)), *more], rng, ('<H', 2, 4))
+    version_seeds = natnet_seeds(version)
+    return Mutator(
+        [*seeds, *version_seeds * (len(seeds) // len(version_seeds)), *more], rng, ('<H', 2, 4)
+    )
 
 
 def emscon_mutator(rng: random.Random, more: Iterable[bytes] = ()) -> Mutator:

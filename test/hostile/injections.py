@@ -292,7 +292,9 @@ def hostile_values(s: Scene) -> None:
     try:
         for topic, kind in topics:
             made.append(node.create_publisher(kind, topic, RELIABLE))
-        s.bench.until(lambda: all(one.get_subscription_count() for one in made), 2.0)
+        s.bench.until(
+            lambda: all(topic_publisher.get_subscription_count() for topic_publisher in made), 2.0
+        )
         for publisher, (_, kind) in zip(made, topics):
             texts = (String(data=''), String(data='x' * 2**20), String(data='{"version": 1e300'))
             odd = texts if kind is String else (kind(),)

@@ -246,7 +246,7 @@ class Judge:
             here, _ = command.spline().at(command.arrival_s)
             led, _ = self._last.spline().at(command.arrival_s)
             off = (here - led, here - command.start_q)
-            further = {'jump_rad': float(min(np.max(np.abs(one)) for one in off))}
+            further = {'jump_rad': float(min(np.max(np.abs(difference)) for difference in off))}
             if command.end_s >= self._last.end_s - SAME_S:
                 admitted = extended(admitted, command)
                 further |= {k: v for k, v in along(admitted, q).items() if k != 'beyond_rad'}
@@ -318,15 +318,15 @@ def along(admitted: Command, q: FloatArray) -> dict[str, float]:
     # What leads straight on beyond the end is told from what leads aside.
     at_end = progress >= float(np.sum(lengths)) - 1e-9
     beyond = float(np.max(((q - ends[-1]) @ directions[-1])[at_end], initial=0.0))
-    away = np.where(at_end, 0.0, distances[rows, nearest])
-    rest = q - ends[-1] - ((q - ends[-1]) @ directions[-1])[:, None] * directions[-1]
-    away = np.where(at_end, np.linalg.norm(rest, axis=1), away)
+    deviation = np.where(at_end, 0.0, distances[rows, nearest])
+    lateral_offset = q - ends[-1] - ((q - ends[-1]) @ directions[-1])[:, None] * directions[-1]
+    deviation = np.where(at_end, np.linalg.norm(lateral_offset, axis=1), deviation)
     # The way back before the start counts too: the arm must not leave the path there.
     start = (q - begins[0]) @ directions[0]
     signed = np.where((progress <= 1e-9) & (start < 0.0), start, progress)
     back = float(np.max(np.maximum.accumulate(signed) - signed))
     return {
-        'off_path_rad': float(np.max(away)),
+        'off_path_rad': float(np.max(deviation)),
         'back_rad': back,
         'beyond_rad': max(beyond, 0.0),
     }

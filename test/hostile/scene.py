@@ -88,8 +88,8 @@ def curve_to(
         shares /= shares[-1]
         way = Spline.through(places, shares).at(np.linspace(0.0, 1.0, 40))
         inside = np.all((way > 0.9 * body.lower) & (way < 0.9 * body.upper))
-        near = np.all(np.abs(way - HOME) <= 1.2 * SPREAD)
-        if inside and near and all(map(body.clear, way)):
+        is_near_home = np.all(np.abs(way - HOME) <= 1.2 * SPREAD)
+        if inside and is_near_home and all(map(body.clear, way)):
             return places[-1], (places[:-1], shares[:-1])
     raise ValueError(f'no curve is clear from {start}')
 

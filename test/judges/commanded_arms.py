@@ -65,16 +65,16 @@ def judged(hidden: HiddenSession, compensator: Compensator, tour: Visits) -> Jud
     spread = T[:3, :3].T @ compensator.spread(tour.q, temperature_c=warm)
     covariance = spread @ np.swapaxes(spread, 1, 2)
     square = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    own = np.zeros((len(error), 3, 9))
-    own[:, :, :3] = np.eye(3)
-    own[:, :, 3:6] = np.cross(np.eye(3), wanted[:, None, :]).swapaxes(1, 2)
-    own[:, :, 6:] = T[:3, :3].T @ nominal[:, :3, :3]
-    columns = own.reshape(-1, 9)
-    left = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
+    design = np.zeros((len(error), 3, 9))
+    design[:, :, :3] = np.eye(3)
+    design[:, :, 3:6] = np.cross(np.eye(3), wanted[:, None, :]).swapaxes(1, 2)
+    design[:, :, 6:] = T[:3, :3].T @ nominal[:, :3, :3]
+    columns = design.reshape(-1, 9)
+    residuals = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
     return Judged(
         rms(error),
         float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)))),
-        rms(left.reshape(-1, 3)),
+        rms(residuals.reshape(-1, 3)),
         float(np.mean(square < IN_95)),
         len(error),
     )

@@ -44,8 +44,8 @@ class Command(NamedTuple):
     @property
     def is_run(self) -> bool:
         """Whether it can be run here: without ROS, on files that are not the reader's own."""
-        own = any(w.startswith(('~', '/')) or w in ('…', 'my_bag') for w in self.words)
-        return self.verb in {*VERBS} - NOT_RUN and not own
+        is_private = any(w.startswith(('~', '/')) or w in ('…', 'my_bag') for w in self.words)
+        return self.verb in {*VERBS} - NOT_RUN and not is_private
 
 
 def commands(page: Path) -> Iterator[Command]:
@@ -90,19 +90,19 @@ def parser(verb: str) -> argparse.ArgumentParser:
 
 def fault(command: Command) -> str:
     """Return what is wrong with a command; '' where nothing is."""
-    program, *rest = command.words
+    program, *args = command.words
     if program == 'remaster':
-        return _remaster(rest)
+        return _remaster(args)
     if program == 'make':
-        return _make(rest)
+        return _make(args)
     if program == 'pip':
-        return _pip(rest)
+        return _pip(args)
     if program == 'python':
-        return _python(rest)
+        return _python(args)
     if program == 'ros2':
-        return _ros2(rest)
+        return _ros2(args)
     if program == 'ssh':
-        return _remaster(rest[rest.index('remaster') + 1 :])
+        return _remaster(args[args.index('remaster') + 1 :])
     return '' if program in OTHERS else f'{program} is no program that this test has heard of'
 
 
@@ -147,33 +147,33 @@ def _python(words: list[str]) -> str:
 
 def _node(name: str, words: list[str]) -> str:
     sections = re.split(r'^## ', (ROOT / 'docs/parameters.md').read_text('utf-8'), flags=re.M)
-    own = next((text for text in sections if text.startswith(f'{name}\n')), None)
-    if own is None:
+    section = next((text for text in sections if text.startswith(f'{name}\n')), None)
+    if section is None:
         return f'there is no node {name}'
     for at, word in enumerate(words):
         if word == '-p':
             parameter = words[at + 1].partition(':=')[0]
-            if f'| `{parameter}` |' not in own and parameter != 'use_sim_time':
+            if f'| `{parameter}` |' not in section and parameter != 'use_sim_time':
                 return f'{name} has no parameter {parameter}'
     return ''
 
 
 def _ros2(words: list[str]) -> str:
-    kind, *rest = words
+    kind, *args = words
     if kind == 'service':
         services = (ROOT / 'docs/topics.md').read_text(encoding='utf-8')
-        return '' if f'`{rest[1]}`' in services else f'docs/topics.md has no service {rest[1]}'
+        return '' if f'`{args[1]}`' in services else f'docs/topics.md has no service {args[1]}'
     if kind == 'launch':
-        path = ROOT / 'launch' / rest[1]
+        path = ROOT / 'launch' / args[1]
         if not path.is_file():
-            return f'there is no {rest[1]}'
+            return f'there is no {args[1]}'
         text = path.read_text(encoding='utf-8')
-        missing = [w for w in rest[2:] if f"'{w.partition(':=')[0]}'" not in text]
-        return f'{rest[1]} has no {missing}' if missing else ''
+        missing = [w for w in args[2:] if f"'{w.partition(':=')[0]}'" not in text]
+        return f'{args[1]} has no {missing}' if missing else ''
     if kind == 'run':
-        return _node(rest[1], rest[2:])
+        return _node(args[1], args[2:])
     if kind == 'param':
-        return _node(rest[1].strip('/'), ['-p', rest[2]])
+        return _node(args[1].strip('/'), ['-p', args[2]])
     return '' if kind in ROS2 else f'ros2 {kind} is not known here'
 
 

@@ -50,28 +50,30 @@ class Oracle:
         basis, singular, _ = np.linalg.svd(np.concatenate((nuisance, prior)), full_matrices=False)
         self._basis = basis[:, singular > 1e-9 * singular[0]]
 
-    def information(self, effect: HiddenEffect, *others: HiddenEffect) -> float:
+    def information(self, effect: HiddenEffect, *alternatives: HiddenEffect) -> float:
         """Noncentrality λ: what is left of the effect in units of the noise, squared and summed.
 
         Parameters
         ----------
         effect
             Of its true size.
-        others
+        alternatives
             What may explain it instead, each of any size.
         """
-        left = self._remainder(self.world.response(effect)[..., None])[:, 0]
-        if others:
-            rivals = np.stack([self.world.response(other) for other in others], axis=-1)
+        residual = self._remainder(self.world.response(effect)[..., None])[:, 0]
+        if alternatives:
+            rivals = np.stack([self.world.response(other) for other in alternatives], axis=-1)
             rivals = self._remainder(rivals)
             rivals = rivals / np.maximum(np.linalg.norm(rivals, axis=0), 1e-30)
-            left = left - rivals @ np.linalg.lstsq(rivals, left, rcond=1e-9)[0]
-        return float(left @ left)
+            residual = residual - rivals @ np.linalg.lstsq(rivals, residual, rcond=1e-9)[0]
+        return float(residual @ residual)
 
     def chi_square(self, effect: HiddenEffect, errors: FloatArray) -> float:
         """Likelihood-ratio statistic of an effect of one value, for errors (n, 3) of all rows."""
-        left = self._remainder(self.world.response(effect)[..., None])[:, 0]
-        return float((left @ self._remainder(errors[..., None])[:, 0]) ** 2 / (left @ left))
+        residual = self._remainder(self.world.response(effect)[..., None])[:, 0]
+        return float(
+            (residual @ self._remainder(errors[..., None])[:, 0]) ** 2 / (residual @ residual)
+        )
 
     def size_for_power(
         self, effect: HiddenEffect, power: float = 0.9, false_alarms: float = 0.02

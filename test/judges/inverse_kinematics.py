@@ -55,16 +55,21 @@ class InverseJudge:
     """
 
     def __init__(
-        self, urdf: str, base: str, tip: str, joints: tuple[str, ...], held: Mapping[int, float]
+        self,
+        urdf: str,
+        base: str,
+        tip: str,
+        joints: tuple[str, ...],
+        held_values: Mapping[int, float],
     ) -> None:
         model = pin.buildModelFromXML(urdf)
         locked = [
             model.getJointId(name)
             for name in model.names.tolist()[1:]
-            if name not in joints or joints.index(name) in held
+            if name not in joints or joints.index(name) in held_values
         ]
         at = pin.neutral(model)
-        for joint, value in held.items():
+        for joint, value in held_values.items():
             at[model.joints[model.getJointId(joints[joint])].idx_q] = value
         self.model = pin.buildReducedModel(model, locked, at)
         self.data = self.model.createData()
@@ -73,7 +78,7 @@ class InverseJudge:
             [
                 self.model.joints[self.model.getJointId(name)].idx_q
                 for i, name in enumerate(joints)
-                if i not in held
+                if i not in held_values
             ]
         )
         kinds = [joint.shortname() for joint in self.model.joints][1:]
@@ -117,6 +122,6 @@ class InverseJudge:
         return np.array(found).reshape(-1, self.model.nq)
 
 
-def apart(q: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the largest joint difference of q (k,) to each of others (n, k), modulo turns."""
-    return np.max(np.abs((others - q + np.pi) % (2 * np.pi) - np.pi), axis=-1)
+def apart(q: FloatArray, solutions: FloatArray) -> FloatArray:
+    """Return the largest joint difference of q (k,) to each of solutions (n, k), modulo turns."""
+    return np.max(np.abs((solutions - q + np.pi) % (2 * np.pi) - np.pi), axis=-1)

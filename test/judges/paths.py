@@ -149,8 +149,8 @@ class FclJudge:
         for i in range(self._moving):
             for j in range(i + 1, len(self._parts)):
                 a, b = int(carriers[i]), int(carriers[j])
-                near = parents[a] == b or parents[b] == a if self._parts[j].link else a == 0
-                if a != b and not near:
+                is_adjacent = parents[a] == b or parents[b] == a if self._parts[j].link else a == 0
+                if a != b and not is_adjacent:
                     pairs.append((i, j))
         rng = np.random.default_rng(1)
         low = np.maximum(self._model.lowerPositionLimit, -np.pi)[self._columns]

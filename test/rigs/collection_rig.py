@@ -64,7 +64,7 @@ class Cell:
         )
         # Who stops it on its way has to meet it there.
         speed = SLOW if by_action else FAST
-        own = {
+        parameters = {
             'fake_robot': {'world': folder / 'world'},
             'pose_planner': {
                 'session': self.session,
@@ -86,26 +86,26 @@ class Cell:
             },
         }
         if by_action:
-            own['robot_bridge']['command_interface'] = 'action'
+            parameters['robot_bridge']['command_interface'] = 'action'
         if compensation:
-            own['robot_bridge']['compensation'] = compensation
-            own['pose_planner']['compensation'] = compensation
-        own['pose_planner'] |= judged or {}
+            parameters['robot_bridge']['compensation'] = compensation
+            parameters['pose_planner']['compensation'] = compensation
+        parameters['pose_planner'] |= judged or {}
         if 'mocap' in sensors:
             ports = {'command_port': command, 'data_port': data}
-            own['fake_optitrack'] = {'world': folder / 'world', 'rate': 12.0, **ports}
-            own['optitrack_markers'] = ports
+            parameters['fake_optitrack'] = {'world': folder / 'world', 'rate': 12.0, **ports}
+            parameters['optitrack_markers'] = ports
         if 'tracker' in sensors:
-            own['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
-            own['laser_tracker_markers'] = {'port': tracker}
+            parameters['fake_laser_tracker'] = {'world': folder / 'world', 'port': tracker}
+            parameters['laser_tracker_markers'] = {'port': tracker}
         for sensor in foreign or {}:
             # Of a world that runs ten times as fast as its messages travel.
             values = {'sensor': sensor, 'max_age_s': 20.0, 'always_sends': sensor == 'mocap'}
             # No section of the shipped file is for nodes of this name.
             values['use_sim_time'] = True
-            own[f'topic_markers_{sensor}'] = values
-        for name in own.keys() - {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}:
-            own[name]['cell'] = cell
+            parameters[f'topic_markers_{sensor}'] = values
+        for name in parameters.keys() - {'fake_robot', 'fake_optitrack', 'fake_laser_tracker'}:
+            parameters[name]['cell'] = cell
         common = ROOT / 'config' / 'fake.yaml'
 
         def begin(name):
@@ -117,7 +117,7 @@ class Cell:
                 where = folder / 'world', sensor, *foreign[sensor]
                 return start('rigs.foreign_source', *where, cwd=ROOT / 'test')
             # By the node's name, which in the file counts more than none.
-            values = {f'{name}:{key}': value for key, value in own[name].items()}
+            values = {f'{name}:{key}': value for key, value in parameters[name].items()}
             arguments = node_arguments(common, **values)
             if name.startswith('topic_markers'):
                 return start(
@@ -128,7 +128,7 @@ class Cell:
             return start(f'remaster_ros.nodes.{name}', *arguments)
 
         self._begin = begin
-        self.nodes = {name: begin(name) for name in own}
+        self.nodes = {name: begin(name) for name in parameters}
         self.nodes |= {f'vendor_{name}': begin(f'vendor_{name}') for name in foreign or {}}
         if by_action:
             self.nodes['action_adapter'] = begin('action_adapter')

@@ -101,18 +101,18 @@ def _make(folder: Path) -> None:
     from rosidl_generator_type_description import generate_type_hash
 
     share = Path(sys.prefix) / 'share'
-    own, made = folder / 'definitions', folder / 'made' / PACKAGE
+    definitions, made = folder / 'definitions', folder / 'made' / PACKAGE
     idl = [Path(name).with_suffix('.idl') for name in DEFINITIONS]
     for name, text in DEFINITIONS.items():
-        path = own / name
+        path = definitions / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-        convert_to_idl(own, PACKAGE, Path(name), own)
+        convert_to_idl(definitions, PACKAGE, Path(name), definitions)
     arguments = {
         'package_name': PACKAGE,
-        'idl_tuples': [f'{own}:{path}' for path in idl],
+        'idl_tuples': [f'{definitions}:{path}' for path in idl],
         'include_paths': [f'{path.name}:{path}' for path in share.iterdir()],
-        'ros_interface_files': [str(own / name) for name in DEFINITIONS],
+        'ros_interface_files': [str(definitions / name) for name in DEFINITIONS],
         'target_dependencies': [],
     }
 
@@ -122,9 +122,9 @@ def _make(folder: Path) -> None:
         file.write_text(json.dumps(arguments | values))
         function(str(file), *further)
 
-    generate(generate_type_hash, own)
+    generate(generate_type_hash, definitions)
     arguments['type_description_tuples'] = [
-        f'{path}:{own / path.with_suffix(".json")}' for path in idl
+        f'{path}:{definitions / path.with_suffix(".json")}' for path in idl
     ]
     for kind in KINDS:
         out = folder / kind / PACKAGE

@@ -43,20 +43,23 @@ def spoilt_text(text, most=None, rng=None):
                 found.append(text[: at + 1] + value + text[end:])
     if most is not None and len(found) > most:
         found = [found[i] for i in sorted(rng.choice(len(found), most, replace=False))]
-    return [String(data=one) for one in found]
+    return [String(data=candidate) for candidate in found]
 
 
 def spoilt_parameters(names):
     """Return a message for each parameter and value, of right and of wrong types."""
     kinds = ParameterType
     values = [
-        *(ParameterValue(type=kinds.PARAMETER_DOUBLE, double_value=one) for one in NUMBERS),
         *(
-            ParameterValue(type=kinds.PARAMETER_INTEGER, integer_value=one)
-            for one in WHOLE
-            if abs(one) < 2**63
+            ParameterValue(type=kinds.PARAMETER_DOUBLE, double_value=content)
+            for content in NUMBERS
         ),
-        *(ParameterValue(type=kinds.PARAMETER_STRING, string_value=one) for one in TEXTS),
+        *(
+            ParameterValue(type=kinds.PARAMETER_INTEGER, integer_value=content)
+            for content in WHOLE
+            if abs(content) < 2**63
+        ),
+        *(ParameterValue(type=kinds.PARAMETER_STRING, string_value=content) for content in TEXTS),
         ParameterValue(type=kinds.PARAMETER_BOOL, bool_value=True),
         ParameterValue(type=kinds.PARAMETER_BYTE_ARRAY, byte_array_value=[b'x']),
         ParameterValue(type=kinds.PARAMETER_DOUBLE_ARRAY, double_array_value=[1.0, math.nan]),
@@ -102,10 +105,10 @@ def _with_values(message, path):
         tried = [b'\x00', b'\xff']
     else:
         tried = list(_sequences(value))
-    for one in tried:
+    for replacement in tried:
         made = copy.deepcopy(message)
         try:
-            setattr(_at(made, path[:-1]), path[-1], one)
+            setattr(_at(made, path[:-1]), path[-1], replacement)
         except (AssertionError, TypeError, OverflowError, ValueError):
             # No message has this value: rclpy's own checks.
             continue
@@ -123,19 +126,19 @@ def _is_possible(message):
 
 
 def _sequences(value):
-    whole = list(value)
+    items = list(value)
     if isinstance(value, np.ndarray):
         # Of fixed length.
-        for one in NUMBERS:
-            yield np.full(len(value), one)
+        for item in NUMBERS:
+            yield np.full(len(value), item)
         return
     for length in LENGTHS:
-        yield (whole * (length + 1))[:length] if whole else []
-    if isinstance(value, array.array) or (whole and isinstance(whole[0], float)):
-        for one in NUMBERS:
-            yield array.array('d', [one] * max(len(whole), 1))
-            yield array.array('d', [*whole[:-1], one])
-    elif whole and isinstance(whole[0], str):
-        for one in TEXTS:
-            yield [*whole[:-1], one]
-        yield [whole[0]] * len(whole)
+        yield (items * (length + 1))[:length] if items else []
+    if isinstance(value, array.array) or (items and isinstance(items[0], float)):
+        for item in NUMBERS:
+            yield array.array('d', [item] * max(len(items), 1))
+            yield array.array('d', [*items[:-1], item])
+    elif items and isinstance(items[0], str):
+        for item in TEXTS:
+            yield [*items[:-1], item]
+        yield [items[0]] * len(items)

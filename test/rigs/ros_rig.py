@@ -38,7 +38,7 @@ def free_domains(first: int = 1, last: int = LAST_DOMAIN) -> Iterator[int]:
     A domain is reserved by a socket of its name, which the kernel removes with the process. The
     last few are held; those before them are free again.
     """
-    held: deque[socket.socket] = deque()
+    reservations: deque[socket.socket] = deque()
     count = last - first + 1
     try:
         # Each run begins elsewhere: a domain given back a moment ago is not taken at once.
@@ -49,12 +49,12 @@ def free_domains(first: int = 1, last: int = LAST_DOMAIN) -> Iterator[int]:
             except OSError:
                 reservation.close()
                 continue
-            held.append(reservation)
-            if len(held) > DOMAINS_HELD:
-                held.popleft().close()
+            reservations.append(reservation)
+            if len(reservations) > DOMAINS_HELD:
+                reservations.popleft().close()
             yield domain
     finally:
-        for reservation in held:
+        for reservation in reservations:
             reservation.close()
 
 

@@ -127,8 +127,8 @@ class Collection:
         measured = session.measurements.orientation
         assert np.isnan(measured[~turned]).all()
         expected = orientation(cell.world, 'mocap', session.measurements.q[turned])
-        apart = Rotation.from_quat(measured[turned]).inv() * Rotation.from_matrix(expected)
-        assert np.max(apart.magnitude()) < 6.0 * SIGMA_RAD
+        turn_error = Rotation.from_quat(measured[turned]).inv() * Rotation.from_matrix(expected)
+        assert np.max(turn_error.magnitude()) < 6.0 * SIGMA_RAD
         errors = found.accuracy['optimization']['post_registration_orientation']
         assert errors['after']['mean_deg'] < errors['before']['mean_deg']
         return session

@@ -37,10 +37,10 @@ def changing_session(recipe: Recipe, share: float, *, ends: bool = False) -> Cha
 
     A drift begins from nothing. The recipe has one kind.
     """
-    whole = hidden_session(recipe)
-    (effect,) = whole.truth.effects
-    m = whole.session.measurements
-    moved = whole.truth.clean - whole.world.seen(())
+    source = hidden_session(recipe)
+    (effect,) = source.truth.effects
+    m = source.session.measurements
+    moved = source.truth.clean - source.world.seen(())
     since = m.stamp_s - m.stamp_s.min()
     duration = float(np.ptp(since))
     moment = share * duration
@@ -48,5 +48,5 @@ def changing_session(recipe: Recipe, share: float, *, ends: bool = False) -> Cha
         shift = np.maximum(since - moment, 0.0)[:, None] * effect.values
     else:
         shift = moved * ((since <= moment) if ends else (since > moment))[:, None]
-    session = replace(whole.session, measurements=replace(m, position=m.position - moved + shift))
+    session = replace(source.session, measurements=replace(m, position=m.position - moved + shift))
     return Changing(session, moment, duration, effect.kind, tuple(effect.joints))

@@ -38,7 +38,7 @@ def save(
     root = np.zeros((k, len(model.parameter_names)))
     root[:, :k] = offset_std * np.eye(k)
     identifiable = tuple(known) or (True,) * k
-    why = tuple('' if one else 'not told' for one in identifiable)
+    why = tuple('' if is_known else 'not told' for is_known in identifiable)
     described = CorrectedArm(
         replace(model, root=root), identifiable, why, np.tile([-2.0, 2.0], (k, 1))
     )

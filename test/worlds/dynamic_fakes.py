@@ -113,7 +113,7 @@ def play(
                 points = np.array([marker.position for marker in seen])
                 frames.append((world.time_s, frame.timestamp, points))
             due.append((since + 1.0 / frames_hz, 'frame'))
-    joints.sort(key=lambda one: one[0])
+    joints.sort(key=lambda entry: entry[0])
     return Played(
         world,
         Stream.of(np.array([t for t, _ in joints]), np.array([q for _, q in joints])),

@@ -49,8 +49,8 @@ def _same_as_offsets(world: HiddenWorld, tilt: HiddenEffect) -> FloatArray:
     responses = np.stack([world.response(turn).ravel() for turn in turns], axis=1)
     nuisance = world.nuisance.reshape(len(responses), -1)
     taken_up = np.linalg.lstsq(nuisance, responses, rcond=1e-9)[0]
-    left = responses - nuisance @ taken_up
-    size, direction = np.linalg.eigh(left.T @ left)
+    residuals = responses - nuisance @ taken_up
+    size, direction = np.linalg.eigh(residuals.T @ residuals)
     # Directions of which next to nothing is left; about the own axis it is the joint's own offset.
     same = direction[:, size < 1e-4 * np.sum(responses**2)]
     steps = taken_up @ (same @ (same.T @ tilt.values)) / 1e-4

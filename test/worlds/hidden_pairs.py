@@ -91,9 +91,9 @@ class PairSession:
 def scene() -> PlanningScene:
     """Return the demo cell with its bar alone."""
     cell = read_cell('demo')
-    whole = cell.planning_scene(cell.chain())
-    sights = [sight for sight in whole.sights if sight.sensor == 'mocap']
-    return replace(whole, sights=sights, aim_at='mocap')
+    cell_scene = cell.planning_scene(cell.chain())
+    sights = [sight for sight in cell_scene.sights if sight.sensor == 'mocap']
+    return replace(cell_scene, sights=sights, aim_at='mocap')
 
 
 @cache

@@ -80,7 +80,7 @@ def predictions_elsewhere(found: Discovery, third: Session) -> Predictions:
         terms, displacement0 = [], np.zeros((len(third.measurements), 3))
         # By their place: two cells without a name may call their parameters alike.
         solution = found.solution
-        named = {name for group in found.groups for one in group for name in one.parameters}
+        named = {name for group in found.groups for member in group for name in member.parameters}
         for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
             if (
                 candidate.driver == 'time'
@@ -109,16 +109,16 @@ class _Elsewhere(PartOfContext):
     """Rows of another session where a cell's zero of time, temperature, place is the first's."""
 
     @classmethod
-    def of(cls, whole: Context, third: Session) -> _Elsewhere:
+    def of(cls, context: Context, third: Session) -> _Elsewhere:
         return cls(
-            whole.chain,
+            context.chain,
             third.measurements,
-            whole.sensor_names,
-            whole.marker_names,
-            whole.joint_offsets,
-            whole.markers,
-            whole.T_R_N,
-            whole,
+            context.sensor_names,
+            context.marker_names,
+            context.joint_offsets,
+            context.markers,
+            context.T_R_N,
+            context,
             np.arange(0),
         )
 

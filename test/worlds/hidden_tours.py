@@ -55,7 +55,7 @@ def visits(
     name: str,
     seed: int,
     candidates: int | None = None,
-    held: tuple[float, ...] = (0.0,),
+    held_values: tuple[float, ...] = (0.0,),
     where: str = 'all',
 ) -> Visits:
     """Plan and order a tour; the same arguments give the same one.
@@ -69,7 +69,7 @@ def visits(
     candidates
         How many to fit, and as many again held out; those that cannot be reached are dropped.
         None for as many as leave about 175 configurations of each split.
-    held
+    held_values
         Values of joint 3 of an arm with seven, rad.
     where
         ``all``: the paper's poses; ``region``: in a small part of their space, the tool hardly
@@ -78,7 +78,7 @@ def visits(
     candidates = CANDIDATES[name] if candidates is None else candidates
     rng = np.random.default_rng([seed, candidates])
     chain = SerialChain.from_urdf(robot(name), 'base_link', 'tool')
-    inverse = InverseKinematics(chain, {2: held} if len(chain) == 7 else None)
+    inverse = InverseKinematics(chain, {2: held_values} if len(chain) == 7 else None)
     # The judges' worlds need no clearance: no real arm takes these paths.
     arm = CollisionModel(chain, arm_bodies(chain, [], 0.075), margin=0.005, unknown_offset=0.0)
     sights = [

@@ -35,8 +35,8 @@ def measured_rows(q: ArrayLike, position: ArrayLike, **columns: ArrayLike) -> Me
         'temperature_c': np.full(rows, np.nan),
     }
     given = {name: np.asarray(values) for name, values in columns.items()}
-    rest = {'q': angles, 'position': np.asarray(position, float)}
-    return replace(Measurements.empty(angles.shape[1]), **{**usual, **rest, **given})
+    readings = {'q': angles, 'position': np.asarray(position, float)}
+    return replace(Measurements.empty(angles.shape[1]), **{**usual, **readings, **given})
 
 
 def predict_in_sensor(

@@ -169,6 +169,6 @@ def write_bag(folder, world: MovingWorld, recording: Recording, kind: str = 'poi
             message = _ros('geometry_msgs/msg/PoseStamped', header=_header(t), pose=pose)
             messages.append((t, f'/bar/{name}/pose', 'geometry_msgs/msg/PoseStamped', message))
     with BagWriter(folder) as writer:
-        for t, topic, msgtype, message in sorted(messages, key=lambda one: one[0]):
+        for t, topic, msgtype, message in sorted(messages, key=lambda entry: entry[0]):
             data = bytes(STORE.serialize_cdr(message, msgtype))
             writer.write(topic, msgtype, data, round(1e9 * t))

@@ -98,8 +98,8 @@ def path_of(
     count = max(6, round(seconds / 0.9)) + 1
     via = MIDDLE + REACH * rng.uniform(-1.0, 1.0, (count, len(MIDDLE)))
     via = np.clip(via, lower + 0.1, upper - 0.1)
-    apart = np.max(np.abs(np.diff(via, axis=0)) / (share * speed), axis=1)
-    times = np.concatenate(([0.0], np.cumsum(np.maximum(apart, 0.3))))
+    durations = np.max(np.abs(np.diff(via, axis=0)) / (share * speed), axis=1)
+    times = np.concatenate(([0.0], np.cumsum(np.maximum(durations, 0.3))))
     spline = CubicSpline(times, via, bc_type='clamped')
     at = np.linspace(0.0, times[-1], 4000)
     faster = np.max(np.abs(spline(at, 1)) / (share * speed))
@@ -219,22 +219,22 @@ class MovingWorld:
         points = tools[1][:, None, :] + np.einsum('nij,mj->nmi', tools[0], self.places)
         shift = self._field(tools, errors, errors.field_m)[:, None, :]
         if errors.own_field_m:
-            own = [self._field(tools, errors, errors.own_field_m) for _ in self.places]
-            shift = shift + np.stack(own, axis=1)
+            marker_fields = [self._field(tools, errors, errors.own_field_m) for _ in self.places]
+            shift = shift + np.stack(marker_fields, axis=1)
         sensor = self.sensor.inverse()
         points = (points + shift) @ sensor.rotation.T + sensor.translation
         points += errors.white_m * rng.standard_normal(points.shape)
         # An encoder's report at a stamp is where the motor was a lag before.
         reports = np.arange(path.x[0], path.x[-1], 1.0 / joints_hz)
-        told = np.stack(
+        reported_q = np.stack(
             [path(np.maximum(reports - lag[j], path.x[0]))[:, j] for j in range(k)], axis=1
         )
-        told += errors.encoder_rad * rng.standard_normal(told.shape)
-        told = np.round(told / errors.resolution_rad) * errors.resolution_rad
+        reported_q += errors.encoder_rad * rng.standard_normal(reported_q.shape)
+        reported_q = np.round(reported_q / errors.resolution_rad) * errors.resolution_rad
         reported = reports + dynamics.jitter_s * rng.standard_normal(len(reports))
         return Recording(
             start_s + np.sort(reported),
-            told,
+            reported_q,
             start_s + stamps,
             points,
             self.joint_offsets,
@@ -302,7 +302,7 @@ def _swung(driven: FloatArray, hz: float, damping: float) -> FloatArray:
         np.zeros((1, 1)),
     )
     A, B, C, D, dt = cont2discrete(system, 1.0 / RATE_HZ)
-    return np.concatenate([dlsim((A, B, C, D, dt), one)[1] for one in driven.T], axis=1)
+    return np.concatenate([dlsim((A, B, C, D, dt), column)[1] for column in driven.T], axis=1)
 
 
 def without_dynamics(dynamics: Dynamics) -> Dynamics:

@@ -110,7 +110,7 @@ def make_session(
         )
         pose = inverse(other) @ transform(state.tool, state.tool_origin) @ jitter @ tool
         board = inverse(pose) if kind == 'camera_on_tool' else pose
-        board = np.array([_by_camera(one, rng) for one in board])
+        board = np.array([_by_camera(board_pose, rng) for board_pose in board])
         pose = inverse(board) if kind == 'camera_on_tool' else board
         position, turned = pose[:, :3, 3], Rotation.from_matrix(pose[:, :3, :3])
     measurements = measured_rows(

@@ -33,15 +33,17 @@ class PlannedMotion:
         index = np.clip(np.searchsorted(self._starts, t, 'right') - 1, 0, len(self._curves) - 1)
         found = np.zeros((len(t), len(self._curves[0].start)))
         for i, curve in enumerate(self._curves):
-            own = index == i
-            since = np.clip(t[own] - self._starts[i], 0.0, curve.duration_s)
-            left = curve.duration_s - since
-            speed = np.minimum(np.minimum(since, left) / RAMP_S, 1.0) * curve.rate
-            change = np.where(left < RAMP_S, -1.0, np.where(since < RAMP_S, 1.0, 0.0))
-            change = np.where((since > 0.0) & (left > 0.0), change * curve.rate / RAMP_S, 0.0)
+            mask = index == i
+            since = np.clip(t[mask] - self._starts[i], 0.0, curve.duration_s)
+            remaining_s = curve.duration_s - since
+            speed = np.minimum(np.minimum(since, remaining_s) / RAMP_S, 1.0) * curve.rate
+            change = np.where(remaining_s < RAMP_S, -1.0, np.where(since < RAMP_S, 1.0, 0.0))
+            change = np.where(
+                (since > 0.0) & (remaining_s > 0.0), change * curve.rate / RAMP_S, 0.0
+            )
             share = np.array([curve.share(s)[0] for s in since.tolist()])
             first, second = curve.spline.at(share, 1), curve.spline.at(share, 2)
-            found[own] = (
+            found[mask] = (
                 curve.spline.at(share),
                 speed[:, None] * first,
                 speed[:, None] ** 2 * second + change[:, None] * first,

@@ -34,12 +34,12 @@ def _carried(text: str, name: str, axis: str, low: float, high: float, origin: s
     )
 
 
-def _with_joint_3(text: str, kind: str, rest: str) -> str:
+def _with_joint_3(text: str, kind: str, tail: str) -> str:
     """Replace the joint that rolls the upper arm."""
     found = re.search(r'<joint name="joint_3".*?</joint>', text, re.DOTALL)
     assert found is not None
     joint = found.group(0).replace('"revolute"', f'"{kind}"')
-    joint = re.sub(r'<axis.*</joint>', rest, joint, flags=re.DOTALL)
+    joint = re.sub(r'<axis.*</joint>', tail, joint, flags=re.DOTALL)
     return text.replace(found.group(0), joint)
 
 
@@ -87,5 +87,5 @@ def sliding_cell(folder: Path, urdf: str, **changes) -> Path:
     """Write a cell of such an arm, the demo's but for these keys; return its path."""
     (folder / 'arm.urdf').write_text(urdf, encoding='utf-8')
     robot = {'urdf': 'arm.urdf', 'base_link': 'base_link', 'tip_link': 'tool'}
-    held = {'held_joint': '', 'held_values_deg': []}
-    return write_cell(folder / 'cell.yaml', **{'robot': robot, **held, **changes})
+    held_joint = {'held_joint': '', 'held_values_deg': []}
+    return write_cell(folder / 'cell.yaml', **{'robot': robot, **held_joint, **changes})
