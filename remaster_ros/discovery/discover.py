@@ -24,6 +24,7 @@ from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Candidate
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import changed
 from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
@@ -193,141 +194,261 @@ def discover_session(
     else:
         before = sound_estimate(session, fitted=partial(estimate_beside, moving))
     found, residuals, pool = _to_search(session, before, rng)
-    effects_tried = effects_of(residuals.context)
-    untestable = {
-        name: why
-        for name, effect in effects_tried.items()
-        if (why := effect.needs(residuals.context))
-    }
-    candidates = [
-        candidate
-        for name, effect in effects_tried.items()
-        if name not in untestable and not effect.moves_the_fit
-        for candidate in effect.candidates(residuals.context)
-    ]
-    candidates += changed(
-        residuals.context,
-        [(candidate, EFFECTS[candidate.name].changes) for candidate in candidates],
-    )
-
-    def walked(data: Residuals, start: Walk | None) -> Walk:
-        first = None if start is None else start.models[0]
-        return Walk(data, candidates, rng, partial(report, 'searching causes'), first)
-
-    walk = walked(residuals, None)
-    data = _judged(found, residuals, walk.best, pool)
-    if data is not residuals:
-        walk = walked(data, walk)
-    groups, described = describe(walk, partial(report, 'comparing look-alikes'))
-    unexplained: tuple[Unexplained, ...] = ()
-    models, background = walk.solutions, walk.models[0].families
-    solution = models[0][0]
-    gain_of_all = walk.models[0].value - walk.bare.value
-    record = SearchRecord.of(walk, groups)
-    # Its columns are most of the memory.
-    del walk
+    candidates, untestable = _candidates(residuals.context)
+    searched = _searched(found, residuals, pool, candidates, rng, report)
     sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
-    named = [candidate for group in groups for candidate in group]
-    try:
-        fit, (gain, metrics), if_drawn = sampled(found, data, models, named)
-    except InsufficientDataError as error:
-        if described:
-            unexplained = (unfitted(data.errors, described, error),)
-        fit = None
-    if fit is not None and is_harmful(gain):
-        if described:
-            unexplained = (harm_of(before, fit, gain, described),)
-        fit = None
-    if fit is None:
-        found, data = before, Residuals.of(before)
-        bare = solve(data, ())
-        assert bare is not None
-        solution, groups, described, background, gain_of_all = bare, (), (), (), 0.0
-        fit, (gain, metrics), if_drawn = sampled(found, data, [(bare, 1.0)], ())
-    is_cause = [EFFECTS[group[0].name].is_cause for group in groups]
-    structure = tuple(e for e, cause in zip(described, is_cause, strict=True) if not cause)
-    residual_structure, gross = structure_left(data, solution, fit, structure)
-    unexplained += residual_structure
-    causes = [
-        (effect.sampled(fit, group, data), group)
-        for effect, group, has_cause in zip(described, groups, is_cause, strict=True)
-        if has_cause
-    ]
-    causes.sort(key=lambda cause: -cause[0].size_m)
-    effects, groups = zip(*causes, strict=True) if causes else ((), ())
-    named = [candidate for group in groups for candidate in group]
-    moved = moved_markers(found, data, solution.noise, named)
-    effects += tuple(effect.sampled(fit) for effect in moved)
-    empty = solve(data, ())
-    assert empty is not None
-    if not effects and not unexplained and gain_of_all > NAMED:
-        unexplained += (nameless(data, solution, p_value(gain_of_all)),)
-    if not effects and not unexplained:
-        unexplained = tuple(beyond_noise(data, fit))
-    verdict: Verdict = 'effects' if effects else 'unexplained' if unexplained else 'none'
-    # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
-    # where held-out poses gain nothing no share is known.
-    leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
-    if any(effect.tied for effect in (*effects[:1], *leading)):
-        verdict = 'undetermined'
+    model = _checked(before, found, searched, sampled)
+    answer = _answer(model)
     report('fitting what can be loaded', 0.0)
-    measured = [
+    measurement_errors = [
         candidate
-        for effect, group in zip(effects, groups, strict=False)
+        for effect, group in zip(answer.effects, answer.groups, strict=False)
         if effect.is_taken_out
         for candidate in group
     ]
-    offsets_fit = fit
-    # Kinds that nobody named are in no file with zero-offsets either.
-    if not {*solution.candidates} <= {*measured}:
-        errors = solve(data, measured) if measured else None
-        offsets_fit = fit_session(
-            session,
-            rng=rng,
-            clock=clock,
-            priors=None if found is before else found.problem.priors,
-            precision=PRECISION,
-            extension=None if errors is None else extension_of(data, errors, found),
-            found=found,
-        )
-    outliers = fit.left_out + gross
-    geometry = geometry_model(found, causes=measured)
+    offsets_fit = _offsets_alone(session, before, model, measurement_errors, rng, clock)
+    outliers = model.fit.left_out + answer.gross
+    geometry = geometry_model(model.found, causes=measurement_errors)
     if geometry is not None:
         geometry = geometry.beside(offsets_fit, [observation for observation, _ in outliers])
+    empty = _bare(model.data)
     thinning = None
-    if len(pool) < len(found.problem.fitted):
-        thinning = judge_by_others(data, found.kept, data.rows.source, empty, solution)
+    if len(pool) < len(model.found.problem.fitted):
+        rows = model.data.rows.source
+        thinning = judge_by_others(model.data, model.found.kept, rows, empty, model.solution)
     result = Discovery(
-        verdict=verdict,
-        effects=effects,
-        gain=gain,
-        metrics=metrics,
-        pose_common_fraction=pose_common_fraction(data, solution),
-        noise_by_range=noise_by_range(data, solution),
+        verdict=answer.verdict,
+        effects=answer.effects,
+        gain=model.gain,
+        metrics=model.metrics,
+        pose_common_fraction=pose_common_fraction(model.data, model.solution),
+        noise_by_range=noise_by_range(model.data, model.solution),
         outliers=outliers,
         untestable=untestable,
         offsets_before=offsets_of(before),
-        groups=groups,
-        background=background,
+        groups=answer.groups,
+        background=model.background,
         empty=empty,
-        solution=solution,
-        residuals=data,
-        fit=fit,
+        solution=model.solution,
+        residuals=model.data,
+        fit=model.fit,
         residuals_before=residuals_of(before),
         alone=offsets_fit,
-        std_if_drawn=if_drawn,
+        std_if_drawn=model.std_if_drawn,
         geometry=geometry,
-        search=record,
+        search=searched.record,
         thinning=thinning,
-        unexplained=unexplained,
+        unexplained=answer.unexplained,
         clocks={} if moving is None else clocks_of(moving),
     )
     if result.loads_geometry:
         return result
     effects = tuple(
-        structs.replace(e, remedy=NOT_LOADED) if e.in_robot_model else e for e in effects
+        structs.replace(effect, remedy=NOT_LOADED) if effect.in_robot_model else effect
+        for effect in answer.effects
     )
     return replace(result, effects=effects)
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """What the walk over models has found."""
+
+    data: Residuals  # Rows that were searched
+    models: list[tuple[Solution, float]]  # Each with its share, the best first
+    background: tuple[Family, ...]  # Of the best model
+    groups: tuple[tuple[Candidate, ...], ...]  # Candidates of each effect
+    effects: tuple[FoundEffect, ...]
+    gain: float  # Log posterior of the best model over that of the offsets alone, nats
+    record: SearchRecord
+
+
+@dataclass(frozen=True, eq=False)
+class _Checked:
+    """The sampled model: that of the walk, or the offsets alone if it does not hold."""
+
+    found: Estimate
+    data: Residuals
+    solution: Solution
+    background: tuple[Family, ...]
+    groups: tuple[tuple[Candidate, ...], ...]
+    effects: tuple[FoundEffect, ...]
+    gain_nats: float  # As `_Searched.gain`
+    fit: FitResult
+    gain: Gain
+    metrics: Mapping[str, Any]
+    std_if_drawn: FloatArray  # See `Discovery`
+    unexplained: tuple[Unexplained, ...]  # Why the model of the walk does not hold
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """Verdict, causes and structure without a cause."""
+
+    verdict: Verdict
+    effects: tuple[FoundEffect, ...]  # The largest first, then markers that have moved
+    groups: tuple[tuple[Candidate, ...], ...]  # Of the effects that the walk has found
+    unexplained: tuple[Unexplained, ...]
+    gross: tuple[tuple[int, str], ...]  # Gross errors of held-out rows
+
+
+def _bare(data: Residuals) -> Solution:
+    """Fit of the offsets without any cause."""
+    solution = solve(data, ())
+    assert solution is not None
+    return solution
+
+
+def _candidates(context: Context) -> tuple[list[Candidate], dict[str, str]]:
+    """Return all candidate causes of a session, and why effects are not testable, by name."""
+    effects_tried = effects_of(context)
+    untestable = {
+        name: why for name, effect in effects_tried.items() if (why := effect.needs(context))
+    }
+    candidates = [
+        candidate
+        for name, effect in effects_tried.items()
+        if name not in untestable and not effect.moves_the_fit
+        for candidate in effect.candidates(context)
+    ]
+    changes = [(candidate, EFFECTS[candidate.name].changes) for candidate in candidates]
+    return [*candidates, *changed(context, changes)], untestable
+
+
+def _searched(
+    found: Estimate,
+    residuals: Residuals,
+    pool: IntArray,
+    candidates: Sequence[Candidate],
+    rng: np.random.Generator,
+    report: Progress,
+) -> _Searched:
+    """Walk over models; again if the best one judges other rows to be gross errors."""
+    walking = partial(report, 'searching causes')
+    walk = Walk(residuals, candidates, rng, walking, None)
+    data = _judged(found, residuals, walk.best, pool)
+    if data is not residuals:
+        walk = Walk(data, candidates, rng, walking, walk.models[0])
+    groups, effects = describe(walk, partial(report, 'comparing look-alikes'))
+    gain = walk.models[0].value - walk.bare.value
+    background = walk.models[0].families
+    # The walk is not kept: its columns are most of the memory.
+    return _Searched(
+        data,
+        walk.solutions,
+        background,
+        groups,
+        effects,
+        gain,
+        SearchRecord.of(walk, groups),
+    )
+
+
+def _checked(
+    before: Estimate,
+    found: Estimate,
+    searched: _Searched,
+    sampled: Callable[..., tuple[FitResult, tuple[Gain, Mapping[str, Any]], FloatArray]],
+) -> _Checked:
+    """Sample the best model; the offsets alone if it does not settle or predicts worse.
+
+    ``sampled``: `_sampled` of the session.
+    """
+    data, effects = searched.data, searched.effects
+    named = [candidate for group in searched.groups for candidate in group]
+    unexplained: tuple[Unexplained, ...] = ()
+    try:
+        fit, (gain, metrics), if_drawn = sampled(found, data, searched.models, named)
+    except InsufficientDataError as error:
+        if effects:
+            unexplained = (unfitted(data.errors, effects, error),)
+    else:
+        if not is_harmful(gain):
+            return _Checked(
+                found,
+                data,
+                searched.models[0][0],
+                searched.background,
+                searched.groups,
+                effects,
+                searched.gain,
+                fit,
+                gain,
+                metrics,
+                if_drawn,
+                (),
+            )
+        if effects:
+            unexplained = (harm_of(before, fit, gain, effects),)
+    data = Residuals.of(before)
+    solution = _bare(data)
+    fit, (gain, metrics), if_drawn = sampled(before, data, [(solution, 1.0)], ())
+    return _Checked(
+        before, data, solution, (), (), (), 0.0, fit, gain, metrics, if_drawn, unexplained
+    )
+
+
+def _answer(model: _Checked) -> _Answer:
+    """Return the verdict on a sampled model, with its causes and what no cause explains."""
+    data, solution, fit = model.data, model.solution, model.fit
+    is_cause = [EFFECTS[group[0].name].is_cause for group in model.groups]
+    structure = tuple(e for e, cause in zip(model.effects, is_cause, strict=True) if not cause)
+    residual_structure, gross = structure_left(data, solution, fit, structure)
+    unexplained = model.unexplained + residual_structure
+    causes = [
+        (effect.sampled(fit, group, data), group)
+        for effect, group, has_cause in zip(model.effects, model.groups, is_cause, strict=True)
+        if has_cause
+    ]
+    causes.sort(key=lambda cause: -cause[0].size_m)
+    effects: tuple[FoundEffect, ...]
+    groups: tuple[tuple[Candidate, ...], ...]
+    effects, groups = zip(*causes, strict=True) if causes else ((), ())
+    named = [candidate for group in groups for candidate in group]
+    moved = moved_markers(model.found, data, solution.noise, named)
+    effects += tuple(effect.sampled(fit) for effect in moved)
+    if not effects and not unexplained and model.gain_nats > NAMED:
+        unexplained += (nameless(data, solution, p_value(model.gain_nats)),)
+    if not effects and not unexplained:
+        unexplained = tuple(beyond_noise(data, fit))
+    return _Answer(_verdict(effects, unexplained), effects, groups, unexplained, gross)
+
+
+def _verdict(effects: Sequence[FoundEffect], unexplained: Sequence[Unexplained]) -> Verdict:
+    """Verdict by the causes and the structure that no cause explains."""
+    # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
+    # where held-out poses gain nothing no share is known.
+    leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
+    if any(effect.tied for effect in (*effects[:1], *leading)):
+        return 'undetermined'
+    return 'effects' if effects else 'unexplained' if unexplained else 'none'
+
+
+def _offsets_alone(
+    session: Session,
+    before: Estimate,
+    model: _Checked,
+    measurement_errors: Sequence[Candidate],
+    rng: np.random.Generator,
+    clock: Callable[[], float] | None,
+) -> FitResult:
+    """Sampled fit for a controller that takes zero-offsets alone, see `Discovery.alone`.
+
+    ``measurement_errors``: causes outside the arm that are certain; these are taken out.
+    """
+    # Kinds that nobody named are in no file with zero-offsets either.
+    if {*model.solution.candidates} <= {*measurement_errors}:
+        return model.fit
+    errors = solve(model.data, measurement_errors) if measurement_errors else None
+    return fit_session(
+        session,
+        rng=rng,
+        clock=clock,
+        priors=None if model.found is before else model.found.problem.priors,
+        precision=PRECISION,
+        extension=None if errors is None else extension_of(model.data, errors, model.found),
+        found=model.found,
+    )
 
 
 def _to_search(
