@@ -26,7 +26,7 @@ from worlds.hidden_arm import six_joint_arm
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.records.reader import write_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 
 WANTED = {2_000: (40.0, 1.0), 20_000: (30.0, 1.0)}  # CPU s, GiB

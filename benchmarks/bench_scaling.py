@@ -30,7 +30,7 @@ from worlds.paper_experiment import CELL, CHAIN, MARKER_OF, MARKERS, experiment,
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.session.records.reader import write_session
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 
 NOISE_M = (0.1e-3, 0.2e-3)

@@ -29,7 +29,7 @@ from remaster_ros.discovery.discover import Discovery, discover_session  # noqa:
 from remaster_ros.discovery.effects.base import Candidate  # noqa: E402
 from remaster_ros.discovery.effects.registry import EFFECTS  # noqa: E402
 from remaster_ros.discovery.residuals import Residuals  # noqa: E402
-from remaster_ros.simulation.hidden_effects import HiddenEffect  # noqa: E402
+from remaster_ros.simulation.hidden_effect import HiddenEffect  # noqa: E402
 
 NOISE = Noise(0.08e-3, 0.1e-3)
 SHARED_NOISE = Noise(0.05e-3, 0.25e-3)

@@ -377,8 +377,8 @@ def simulate(
     from remaster_ros.errors import InputError
     from remaster_ros.session.cells.workcell import read_cell
     from remaster_ros.simulation.effect_sampling import EffectSpec
+    from remaster_ros.simulation.simulated_session import DEFAULT_OFFSET_STD
     from remaster_ros.simulation.simulated_workcell import (
-        DEFAULT_OFFSET_STD,
         choose_robot,
         choose_sensors,
         simulate_workcell,
@@ -447,7 +447,7 @@ def plan(
     import numpy as np
 
     from remaster_ros.session.cells.workcell import read_cell
-    from remaster_ros.simulation.simulated_workcell import plan_tour
+    from remaster_ros.simulation.simulated_tour import plan_tour
 
     workcell = read_cell(os.fspath(cell))
     counts = {'optimization': poses, 'validation': validation_poses}

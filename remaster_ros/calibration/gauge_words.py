@@ -19,6 +19,9 @@ from remaster_ros.types import FloatArray
 MOST_NAMED, MOST_LISTED = 5, 20
 LEAST_SHARE = 0.2
 EFFECTS_PRIOR = 'the prior on the effects'
+# The share of a parameter in a direction, or its displacement.
+_AMOUNT = re.compile(r' \([+-][\d.e+-]+\)|(?: tangentially)?, [\d.]+ mm per degree')
+_MOST_SHOWN = 2
 
 
 def counted(number: int, what: str) -> str:
@@ -127,11 +130,6 @@ def _shortened(parts: Sequence[str]) -> str:
         excess = len(parts) - MOST_NAMED
         return listed([*parts[:MOST_NAMED], f'{excess} more'])
     return listed(parts)
-
-
-# The share of a parameter in a direction, or its displacement.
-_AMOUNT = re.compile(r' \([+-][\d.e+-]+\)|(?: tangentially)?, [\d.]+ mm per degree')
-_MOST_SHOWN = 2
 
 
 def in_a_line(why: str) -> str:

@@ -24,7 +24,7 @@ from scipy.special import chdtrc
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.gauge_words import listed
 from remaster_ros.calibration.identifiability import OPEN_ANGLE
-from remaster_ros.calibration.result import robust_std
+from remaster_ros.calibration.robust_std import robust_std
 from remaster_ros.calibration.smooth_functions import of_links, spread_poses, whitened
 from remaster_ros.types import BoolArray, FloatArray
 

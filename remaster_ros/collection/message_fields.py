@@ -11,6 +11,14 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.types import FloatArray
 
+WANTED = 'wanted/'
+"""Prefix of joint names in remaster/settled for wanted positions, before a correction."""
+CORRECTED = {'on': 'corrected/', 'off': 'uncorrected/'}
+"""Prefixes of all joint names in remaster/joint_solutions, by whether commands are corrected. The
+prefix is in the names, so that a bridge that ignores it finds none of its joints."""
+LENGTH_TOLERANCE = 1e-3
+"""Largest difference of a quaternion's length from 1: some drivers send single precision."""
+
 
 def seconds(stamp: Any) -> float:
     """Stamp or duration (builtin_interfaces/Time, /Duration) in seconds."""
@@ -68,10 +76,6 @@ class JointOrder:
         return np.array([positions[column] for column in self._columns])
 
 
-WANTED = 'wanted/'
-"""Prefix of joint names in remaster/settled for wanted positions, before a correction."""
-
-
 def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
     """Wanted positions of a settled arm, before a correction, rad, (k,).
 
@@ -94,11 +98,6 @@ def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> 
             f'{topic} has {", ".join(repeated)} more than once: are two arms merged in it? Give '
             'the joints of each a prefix, or each arm a namespace'
         )
-
-
-CORRECTED = {'on': 'corrected/', 'off': 'uncorrected/'}
-"""Prefixes of all joint names in remaster/joint_solutions, by whether commands are corrected. The
-prefix is in the names, so that a bridge that ignores it finds none of its joints."""
 
 
 def correction_asked(message: Any) -> str:
@@ -130,10 +129,6 @@ def solutions_of(message: Any, joint_names: Sequence[str]) -> FloatArray:
         raise InputError(f'a point has not as many positions as joints, {len(given)}')
     columns = [given.index(name) for name in joint_names]
     return np.array([point.positions for point in message.points])[:, columns]
-
-
-LENGTH_TOLERANCE = 1e-3
-"""Largest difference of a quaternion's length from 1: some drivers send single precision."""
 
 
 def unit_quaternion(turn: Any) -> FloatArray | None:

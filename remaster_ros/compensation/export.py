@@ -43,6 +43,13 @@ _LIMITS = {
     'limit': {'lower', 'upper'},
     'safety_controller': {'soft_lower_limit', 'soft_upper_limit'},
 }
+_PLAIN = """\
+1. Re-master on the pad: drive each joint to the angle in the last column, as the
+   robot reports it now, and set that place as the joint's new zero."""
+_PAD = """\
+1. Re-master on the pad, in the numbers of the pad, line by line: drive the joint until
+   the pad shows the angle under "drive to", and set it, in that place, so that the pad
+   shows the angle under "set to". Any other place does as well: add the same angle to both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,15 +218,6 @@ def remaster_text(
         ],
     )
     return '\n\n'.join('\n'.join(lines) for lines in paragraphs if lines) + '\n'
-
-
-_PLAIN = """\
-1. Re-master on the pad: drive each joint to the angle in the last column, as the
-   robot reports it now, and set that place as the joint's new zero."""
-_PAD = """\
-1. Re-master on the pad, in the numbers of the pad, line by line: drive the joint until
-   the pad shows the angle under "drive to", and set it, in that place, so that the pad
-   shows the angle under "set to". Any other place does as well: add the same angle to both."""
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:

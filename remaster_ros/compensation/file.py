@@ -53,6 +53,11 @@ DIGITS = 10
 LARGEST = 1e9
 
 Source = Literal['fit', 'discover']
+_FRAMES = (
+    'shift: m, in the frame of the link that the joint before moves (base_link for the first); '
+    "turn: rotation vector, rad, in the joint's own frame at angle 0. "
+    'Origin of a joint = T_nominal with shift added to its translation, times Rot(turn).'
+)
 
 
 class RobotPart(Robot):
@@ -230,13 +235,6 @@ class Compensation:
         Further arguments and errors as of `corrected_trajectory`.
         """
         return corrected_trajectory(self.compensator, times_s, positions, velocities, **more)
-
-
-_FRAMES = (
-    'shift: m, in the frame of the link that the joint before moves (base_link for the first); '
-    "turn: rotation vector, rad, in the joint's own frame at angle 0. "
-    'Origin of a joint = T_nominal with shift added to its translation, times Rot(turn).'
-)
 
 
 def written(described: CorrectedArm, session: Session, made_by: Source, result_sha256: str) -> str:

@@ -54,6 +54,12 @@ _DRIVERS: dict[str, Driver] = {
     'gravity_force': 'gravity_torque',
     'temperature': 'temperature',
 }
+_OF_MEASUREMENT = 'it is an error of the measurement and not of the arm'
+_OF_GUIDE = 'compensation.json has no term for a carriage that leaves its way or turns along it'
+_NOT_TOLD = (
+    'it depends on what no controller is told (time, the last move, what happened once, on which '
+    'side the base lies)'
+)
 
 
 @dataclass(frozen=True)
@@ -516,14 +522,6 @@ def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatA
         driver, 'bspline', joint, knots=curve.knots, degree=DEGREE, turn_start=curve.start
     )
     return function, heights
-
-
-_OF_MEASUREMENT = 'it is an error of the measurement and not of the arm'
-_OF_GUIDE = 'compensation.json has no term for a carriage that leaves its way or turns along it'
-_NOT_TOLD = (
-    'it depends on what no controller is told (time, the last move, what happened once, on which '
-    'side the base lies)'
-)
 
 
 def _not_corrected(

@@ -37,8 +37,8 @@ from remaster_ros.demo.processes import NodeProcesses, free_ports
 from remaster_ros.demo.tables import print_hidden, print_offsets, print_times, true_errors
 from remaster_ros.errors import DeviceError, InputError, RemasterError
 from remaster_ros.nodes.launching import CORE, SENSORS
+from remaster_ros.nodes.opening_file import opening_path, page_name
 from remaster_ros.nodes.running import report
-from remaster_ros.nodes.runtime_files import opening_path, page_name
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import read_fit

@@ -42,6 +42,14 @@ CLEAR = 2.0
 SAME = 1.0 - 1e-6
 # Of a matrix with ones on its diagonal.
 ROUNDING = 1e-12
+OTHER_FORM = 'a part or another form of a cause that is named'
+NOT_IN_BEST = 'other models have it, the likeliest one has not'
+"""Why a cause of a probability above one half is not named."""
+CHANGED = (
+    'Find what was changed at that moment: a payload put on or taken off, a setting of the '
+    'controller, something that came loose. Measure before and after it in sessions of their own.'
+)
+"""What to do about a cause that begins or changes in mid-session."""
 
 
 class Parameter(Struct, frozen=True):
@@ -357,11 +365,6 @@ def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
     return bool(cosines.min() > SAME)
 
 
-OTHER_FORM = 'a part or another form of a cause that is named'
-NOT_IN_BEST = 'other models have it, the likeliest one has not'
-"""Why a cause of a probability above one half is not named."""
-
-
 class LessLikely(Struct, frozen=True):
     """A cause that some models have and that is not named.
 
@@ -423,13 +426,6 @@ class SearchRecord(Struct, frozen=True):
             float(walk.share[0]),
             tuple(less[:MOST_LISTED]),
         )
-
-
-CHANGED = (
-    'Find what was changed at that moment: a payload put on or taken off, a setting of the '
-    'controller, something that came loose. Measure before and after it in sessions of their own.'
-)
-"""What to do about a cause that begins or changes in mid-session."""
 
 
 def size_of(data: Residuals, solution: Solution, group: Sequence[Candidate]) -> float:

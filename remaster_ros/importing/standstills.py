@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from remaster_ros.calibration.arrangement import linear_fit
-from remaster_ros.collection.pairing import SensorRules, are_too_many, of_the_marker
+from remaster_ros.collection.pairing import SensorRules
+from remaster_ros.collection.still_frames import are_too_many, of_the_marker
 from remaster_ros.errors import InputError
 from remaster_ros.importing.columns import Table
 from remaster_ros.importing.units import ANGLES, LENGTHS

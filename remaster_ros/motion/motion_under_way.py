@@ -44,6 +44,11 @@ ELSEWHERE = 'an emergency stop, or an arm less precise than arrive_tolerance?'
 Outcome = tuple[Literal['', 'over', 'settled', 'failed', 'halted'], str]
 """The outcome, and why, as text; '' while it is under way."""
 UNDER_WAY: Outcome = '', ''
+STOPPED_S = 1.0
+"""After the end of a stop the arm stands within so much time, s; the lag comes on top."""
+OTHER_PLACES = 2.0
+"""An arm may stand so many times as far from its end as it was seen to elsewhere: a servo that
+gives way under the arm's weight does so by another amount in every configuration."""
 
 
 @dataclass
@@ -174,13 +179,6 @@ def _led_now(seen: Seen, wall_s: float) -> float:
     (`simulated_clock.LEADS`): it is not ahead of the last one by what its rate would have.
     """
     return seen.now(wall_s, 1.0)
-
-
-STOPPED_S = 1.0
-"""After the end of a stop the arm stands within so much time, s; the lag comes on top."""
-OTHER_PLACES = 2.0
-"""An arm may stand so many times as far from its end as it was seen to elsewhere: a servo that
-gives way under the arm's weight does so by another amount in every configuration."""
 
 
 class MotionUnderWay:

@@ -44,11 +44,12 @@ from remaster_ros.motion.motion_gate import (
 )
 from remaster_ros.motion.motion_under_way import STOPPED_S
 from remaster_ros.motion.settling import SettleRules
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.controller_link import control_messages
 from remaster_ros.nodes.messages import duration_of
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
+from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.robot_bridge import DESCRIPTION, DESCRIPTION_QOS, NEWEST_STATES
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.status import LEASED, RELIABLE

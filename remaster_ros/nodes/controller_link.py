@@ -32,7 +32,8 @@ from remaster_ros.errors import InputError
 from remaster_ros.motion.actions import SupervisorRules
 from remaster_ros.motion.following import path_tolerance
 from remaster_ros.nodes.messages import duration_of
-from remaster_ros.nodes.status import LEASED, RELIABLE, UNNAMED
+from remaster_ros.nodes.qos import UNNAMED
+from remaster_ros.nodes.status import LEASED, RELIABLE
 from remaster_ros.sensors.registry import kind_of
 from remaster_ros.types import FloatArray
 

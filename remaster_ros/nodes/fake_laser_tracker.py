@@ -9,7 +9,8 @@ import numpy as np
 
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
 from remaster_ros.simulation.setup import open_world
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 from remaster_ros.simulation.setup import open_world
 
 

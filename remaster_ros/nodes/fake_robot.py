@@ -35,7 +35,8 @@ from remaster_ros.simulation.setup import (
     make_world,
     open_world,
 )
-from remaster_ros.simulation.world_clock import POLL_WALL_S, Pace
+from remaster_ros.simulation.world_clock import POLL_WALL_S
+from remaster_ros.simulation.world_pace import Pace
 
 STANDING_CLOCK_WALL_S = 0.1
 """A clock that stands is published so often, s of wall time."""

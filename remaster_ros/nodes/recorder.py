@@ -28,11 +28,11 @@ from trajectory_msgs.msg import JointTrajectory
 from remaster_ros.collection import events
 from remaster_ros.collection.recording import EndedReading
 from remaster_ros.errors import DiskError
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.cell_sensors import CellSensors
 from remaster_ros.nodes.controller_link import COMMANDS, COPIES
 from remaster_ros.nodes.messages import transform_message
 from remaster_ros.nodes.parameters import declare
-from remaster_ros.nodes.rivals import JOINTS, ArmStates
 from remaster_ros.nodes.running import RemasterNode, run
 from remaster_ros.nodes.session_keeper import SessionKeeper
 from remaster_ros.nodes.simulated_clock import ReportsTaken

@@ -30,8 +30,9 @@ from remaster_ros.collection import events
 from remaster_ros.errors import InputError, InsufficientDataError, RemasterError
 from remaster_ros.nodes.messages import message_class, stamp_of
 from remaster_ros.nodes.parameters import declare, parameter
+from remaster_ros.nodes.qos import node_of
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.status import EVENTS, MESSAGES_TAKEN, node_of, taken_key
+from remaster_ros.nodes.status import EVENTS, MESSAGES_TAKEN, taken_key
 from remaster_ros.nodes.status import TOPIC as STATUS
 from remaster_ros.session.bags.bag import LATCHED_TOPICS, RECORDED, BagReader, live_name
 

@@ -10,19 +10,16 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -60,6 +57,7 @@ from remaster_ros.motion.path_check import PointSpeeds
 from remaster_ros.motion.path_search import PathSearch
 from remaster_ros.motion.pieces import HORIZON_S, LEAST_HORIZON_S
 from remaster_ros.motion.settling import SettleRules
+from remaster_ros.nodes.arm_states import JOINTS, ArmStates
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.controller_link import (
     COMMANDS,
@@ -76,7 +74,7 @@ from remaster_ros.nodes.messages import (
     waypoints_by_solution,
 )
 from remaster_ros.nodes.parameters import declare, parameter
-from remaster_ros.nodes.rivals import JOINTS, ArmStates, OnlyPublisher
+from remaster_ros.nodes.rivals import OnlyPublisher
 from remaster_ros.nodes.running import RemasterNode, fault_of_this_program, run
 from remaster_ros.nodes.simulated_clock import ReportsTaken, SteadyTime
 from remaster_ros.nodes.status import RELIABLE, NodeStatus, Summary, listen
@@ -87,7 +85,7 @@ from remaster_ros.types import FloatArray
 
 if TYPE_CHECKING:
     from remaster_ros.compensation.in_use import CorrectionInUse
-
+from remaster_ros.nodes.emergency_link import EmergencyLink
 
 SOLUTIONS = 'remaster/joint_solutions'
 WAYPOINTS = 'remaster/joint_waypoints'
@@ -307,64 +305,6 @@ class Parameters(SimulationParameters):
             self.cartesian_speed_limit_m_s or np.inf,
             float(np.deg2rad(self.limit_margin_deg)),
         )
-
-
-# The link to the robot's own safety circuit: a std_msgs/Bool, true while it stops the arm.
-
-
-PERIODIC = 6
-"""By so many messages it is judged whether they come regularly."""
-
-
-class EmergencyLink:
-    """Follow a topic; a link that is silent is trouble.
-
-    ``topic``: the topic; '' for no such link; ``on_state``: called with every message's value;
-    ``silence_s``: messages that come regularly and then are silent for so much longer than between
-    them are missed, s of wall time.
-    """
-
-    def __init__(
-        self, node: Node, topic: str, on_state: Callable[[bool], None], silence_s: float
-    ) -> None:
-        self._node, self._on_state, self._silence_s = node, on_state, silence_s
-        self.topic = node.resolve_topic_name(topic) if topic else ''
-        self._stamps: deque[float] = deque(maxlen=PERIODIC)
-        if not topic:
-            return
-        # The last value of a publisher that keeps it, and whatever any publisher sends from now
-        # on: one subscription cannot have both.
-        for durability, reliability in (
-            (DurabilityPolicy.TRANSIENT_LOCAL, ReliabilityPolicy.RELIABLE),
-            (DurabilityPolicy.VOLATILE, ReliabilityPolicy.BEST_EFFORT),
-        ):
-            qos = QoSProfile(depth=50, durability=durability, reliability=reliability)
-            node.create_subscription(Bool, self.topic, self._on_message, qos)
-
-    def trouble(self) -> str:
-        """Return why the state of the safety circuit is unknown, or ''.
-
-        It is if no message has come, no publisher is left, or the last `PERIODIC` messages came
-        regularly (at most `silence_s` apart) and the silence since exceeds their longest interval
-        by more than that. '' without a topic.
-        """
-        if not self.topic:
-            return ''
-        if not self._stamps:
-            return f'{self.topic} (emergency_stop_topic) is silent: nothing moves without it'
-        if not self._node.count_publishers(self.topic):
-            return f'{self.topic} (emergency_stop_topic) has no publisher any more'
-        if len(self._stamps) == PERIODIC:
-            longest = max(later - earlier for earlier, later in pairwise(self._stamps))
-            silent_s = time.monotonic() - self._stamps[-1]
-            if longest <= self._silence_s < silent_s - longest:
-                return f'{self.topic} (emergency_stop_topic) has been silent for {silent_s:.1f} s'
-        return ''
-
-    def _on_message(self, message: Bool) -> None:
-        """Note the time of a message, and hand its value on."""
-        self._stamps.append(time.monotonic())
-        self._on_state(message.data)
 
 
 class RobotBridge(RemasterNode):

@@ -36,9 +36,9 @@ from remaster_ros.collection.plan_confirmation import service_name
 from remaster_ros.errors import RemasterError
 from remaster_ros.nodes.background import Background
 from remaster_ros.nodes.messages import read_place, transform_array, waypoints_by_solution
+from remaster_ros.nodes.opening_file import opening_file, page_name
 from remaster_ros.nodes.parameters import declare, parameter
 from remaster_ros.nodes.running import RemasterNode, run
-from remaster_ros.nodes.runtime_files import opening_file, page_name
 from remaster_ros.nodes.rviz_markers import RvizMarkers
 from remaster_ros.nodes.status import (
     LATCHED,

@@ -33,7 +33,7 @@ from remaster_ros.collection.pairing import PairedReading, SensorRules
 from remaster_ros.collection.peers import RequiredSensors
 from remaster_ros.collection.plausibility import Plausibility
 from remaster_ros.collection.recording import BY_HAND, EndedReading, Recording
-from remaster_ros.collection.reference_watch import SetupChanges
+from remaster_ros.collection.setup_changes import SetupChanges
 from remaster_ros.errors import InputError
 from remaster_ros.motion.joint_units import JointUnits
 from remaster_ros.parameters import SimulationParameters, parameter

@@ -10,14 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.simulation.hidden_effects import (
-    KINDS,
-    NAMED,
-    OF_SLIDES,
-    DrawContext,
-    HiddenEffect,
-    in_own_units,
-)
+from remaster_ros.simulation.hidden_effect import DrawContext, HiddenEffect
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, OF_SLIDES, in_own_units
 from remaster_ros.simulation.truth import SessionTruth
 from remaster_ros.simulation.world_model import WorldModel
 

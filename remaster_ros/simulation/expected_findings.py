@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from remaster_ros.simulation.hidden_effects import KINDS, NAMED, HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED
 
 Cause = tuple[str, tuple[int, ...], str]
 """Name, joints, and further: place and driver of an effect without a name, or a sensor's name."""

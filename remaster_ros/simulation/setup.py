@@ -16,9 +16,9 @@ import yaml
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.session.cells.workcell import Workcell, config_path
+from remaster_ros.simulation.chain_arm import model_of_tour
 from remaster_ros.simulation.dynamics import Dynamics
 from remaster_ros.simulation.effect_sampling import EffectSpec, with_effects
-from remaster_ros.simulation.hidden_arm import model_of_tour
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming, place_sensor
 from remaster_ros.simulation.world import START_S, WORLD_FILE, World, WorldContent
 from remaster_ros.types import FloatArray
@@ -135,7 +135,7 @@ def make_world(
     truth = SessionTruth(joint_offsets, markers, sensors, warming)
     if hidden:
         # Imported here: a fake device plans nothing.
-        from remaster_ros.simulation.simulated_workcell import plan_tour, visit
+        from remaster_ros.simulation.simulated_tour import plan_tour, visit
 
         # Effects get the requested sizes on a tour like the one that will be visited.
         rng = np.random.default_rng([seed, 2])

@@ -21,7 +21,7 @@ from remaster_ros.kinematics.transforms import (
     transform,
 )
 from remaster_ros.session.yaml_records import to_plain
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import FloatArray
 
 ROLL_RAD = 0.2

@@ -16,14 +16,14 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from remaster_ros.simulation.hidden_effects import (
+from remaster_ros.simulation.hidden_effect import (
     SLACK_RAD,
     SLIDE_M,
     Circumstances,
     Deviation,
     HiddenEffect,
-    add_effect,
 )
+from remaster_ros.simulation.hidden_effects import add_effect
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import BoolArray, FloatArray
 

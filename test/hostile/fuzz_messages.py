@@ -11,20 +11,22 @@ import random
 import struct
 from collections.abc import Iterable, Sequence
 
-from remaster_ros.sensors.laser_tracker import packets
+from remaster_ros.sensors.laser_tracker import codes
 from remaster_ros.sensors.laser_tracker import packets as emscon
-from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.natnet import (
+from remaster_ros.sensors.optitrack import natnet, natnet_bytes, natnet_model
+from remaster_ros.sensors.optitrack.natnet_frame import (
     TRACKING_VALID,
     Frame,
     LabeledMarker,
+    RigidBody,
+)
+from remaster_ros.sensors.optitrack.natnet_model import (
     MarkerSetDescription,
     ModelDefinition,
-    RigidBody,
     RigidBodyDescription,
 )
 
-VERSIONS: tuple[natnet.Version, ...] = (
+VERSIONS: tuple[natnet_bytes.Version, ...] = (
     (2, 6), (2, 7), (2, 9), (2, 10), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (4, 3),
 )  # fmt: skip
 _INTEGERS = (0, 1, -1, 2, 255, 65535, 70_000, 10**6, 2**31 - 1, -(2**31), 2**30, 4711)
@@ -34,7 +36,7 @@ _LONGEST = 65_507
 
 
 def full_frame(
-    version: natnet.Version, number: int = 7, markers: int = 4, stray: bool = True
+    version: natnet_bytes.Version, number: int = 7, markers: int = 4, stray: bool = True
 ) -> Frame:
     """Return a frame with something in every section that the version has."""
     residual = 2e-4 if version >= (3, 0) else None
@@ -70,7 +72,7 @@ def full_frame(
     )
 
 
-def server_info(version: natnet.Version) -> natnet.ServerInfo:
+def server_info(version: natnet_bytes.Version) -> natnet.ServerInfo:
     """Return a server's answer to CONNECT."""
     connection = natnet.Connection(10_000_000, 1511, True, '239.255.42.99')
     return natnet.ServerInfo(
@@ -85,17 +87,17 @@ BODY = RigidBodyDescription(
 MODEL = ModelDefinition((MarkerSetDescription('tool', ('a', 'b', 'c')), BODY))
 
 
-def skeleton_definition(version: natnet.Version) -> bytes:
+def skeleton_definition(version: natnet_bytes.Version) -> bytes:
     """Return the datagram of a skeleton, of which a client keeps the name alone."""
     sized = version >= (4, 1)
-    body = natnet.encode_model_definition(ModelDefinition((BODY,)), version)
+    body = natnet_model.encode_model_definition(ModelDefinition((BODY,)), version)
     hand = b'hand\0' + struct.pack('<2i', 2, 1) + body[12 if sized else 8 :]
     size = struct.pack('<i', len(hand)) if sized else b''
-    payload = struct.pack('<2i', 1, natnet.SKELETON) + size + hand
+    payload = struct.pack('<2i', 1, natnet_model.SKELETON) + size + hand
     return natnet.join_datagram(natnet.MessageId.MODELDEF, payload)
 
 
-def natnet_seeds(version: natnet.Version | None = None) -> list[bytes]:
+def natnet_seeds(version: natnet_bytes.Version | None = None) -> list[bytes]:
     """Return valid datagrams of every kind and of one version, or of all."""
     seeds = []
     for spoken in [version] if version else VERSIONS:
@@ -127,7 +129,7 @@ def measurement() -> emscon.Measurement:
     three = (1e-5, 2e-5, 3e-5)
     return emscon.Measurement(
         0,
-        packets.STATIONARY,
+        codes.STATIONARY,
         0,
         (2.0, 0.5, -0.3),
         three,
@@ -154,7 +156,7 @@ def emscon_seeds() -> list[bytes]:
             emscon.UnknownPacket(77, b'12345678'),
         )
     ]
-    for command in packets.Command:
+    for command in codes.Command:
         for kind, layout in (('request', command.request), ('reply', command.reply)):
             zeros = layout.unpack(bytes(layout.size))
             filled = tuple(
@@ -277,7 +279,7 @@ class Mutator:
 
 
 def natnet_mutator(
-    rng: random.Random, version: natnet.Version, more: Iterable[bytes] = ()
+    rng: random.Random, version: natnet_bytes.Version, more: Iterable[bytes] = ()
 ) -> Mutator:
     """Return a source of spoilt datagrams, every second one of `version`.
 

@@ -19,14 +19,11 @@ from pathlib import Path
 import numpy as np
 from hostile.fuzz_messages import MODEL, VERSIONS, full_frame, server_info
 
-from remaster_ros.sensors.laser_tracker import packets
+from remaster_ros.sensors.laser_tracker import codes
 from remaster_ros.sensors.laser_tracker import packets as emscon
-from remaster_ros.sensors.laser_tracker.client import (
-    LaserTrackerClient,
-    LaserTrackerError,
-    LaserTrackerSettings,
-)
-from remaster_ros.sensors.optitrack import marker_follower, natnet
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerError, LaserTrackerSettings
+from remaster_ros.sensors.optitrack import marker_follower, natnet, natnet_bytes
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice, MarkerSample
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
@@ -46,9 +43,9 @@ def decode_as_any_version(rng: random.Random) -> Target:
     """Return the bare decoders, for a server's and a client's messages."""
 
     def target(data: bytes) -> None:
-        with contextlib.suppress(natnet.ProtocolError):
+        with contextlib.suppress(natnet_bytes.ProtocolError):
             natnet.decode_message(data, rng.choice(VERSIONS))
-        with contextlib.suppress(natnet.ProtocolError):
+        with contextlib.suppress(natnet_bytes.ProtocolError):
             natnet.decode_request(data)
 
     return target
@@ -76,7 +73,7 @@ class NatNetClientTarget:
 
     SERVER, STRANGER = '127.0.0.1', '127.0.0.9'
 
-    def __init__(self, rng: random.Random, version: natnet.Version) -> None:
+    def __init__(self, rng: random.Random, version: natnet_bytes.Version) -> None:
         self._rng, self._version = rng, version
         self._lone = rng.random() < 0.2
         self.client = NatNetClient(
@@ -207,9 +204,9 @@ class TrackerClientTarget:
         reader = emscon.PacketReader('client')
         command = rng.choice((self._measure, self._measure, self.client.request_status))
         expected = (
-            emscon.Reply(packets.Command.START_MEASUREMENT)
+            emscon.Reply(codes.Command.START_MEASUREMENT)
             if command == self._measure
-            else emscon.Reply(packets.Command.GET_TRACKER_STATUS, 0, (rng.randrange(4),))
+            else emscon.Reply(codes.Command.GET_TRACKER_STATUS, 0, (rng.randrange(4),))
         )
         first = emscon.encode(expected) if rng.random() < 0.7 else b''
         cut = rng.randrange(len(data) + 1)

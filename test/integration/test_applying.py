@@ -17,7 +17,7 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.reports.fit_json import joint_offsets_of, read_fit
 from remaster_ros.session.records.reader import write_session
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import Session
 

@@ -20,13 +20,15 @@ from worlds import optitrack_world, tracker_world
 
 from remaster_ros.calibration.registration import register_ransac
 from remaster_ros.errors import DeviceError, InsufficientDataError
-from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient, LaserTrackerSettings
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerSettings
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
 from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 from remaster_ros.session.cells.workcell import read_cell
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.setup import make_world
 

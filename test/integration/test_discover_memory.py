@@ -16,7 +16,7 @@ from worlds.calibration_scenes import CHAIN, MARKERS, URDF, sensors
 
 from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.session.records.reader import write_session
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 
 # The command with a search of few rows, so that what all rows take is what counts; then the
 # largest resident memory of this process alone, which os.wait4 mixes up with its parent's.

@@ -24,15 +24,8 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.simulation.effect_sampling import draw_effect
-from remaster_ros.simulation.hidden_effects import (
-    ARC_MINUTE,
-    NAMED,
-    UNNAMED,
-    Deviation,
-    HiddenEffect,
-    add_effect,
-    true_parameters,
-)
+from remaster_ros.simulation.hidden_effect import ARC_MINUTE, Deviation, HiddenEffect
+from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, add_effect, true_parameters
 from remaster_ros.types import FloatArray
 
 

@@ -26,7 +26,7 @@ from remaster_ros.reports.figures import causes
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec, draw_effect
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.simulation.simulated_workcell import simulate_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 from remaster_ros.simulation.world_model import deviation

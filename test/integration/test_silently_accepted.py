@@ -15,7 +15,7 @@ from worlds import robot_descriptions
 
 from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.records.reader import read_chain, read_session, write_session
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 
 

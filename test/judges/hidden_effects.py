@@ -21,7 +21,8 @@ from judges.hidden_oracle import Oracle
 from worlds.hidden_world import HiddenTruth, HiddenWorld
 
 from remaster_ros.simulation.expected_findings import Cause, answers, causes, named_cause
-from remaster_ros.simulation.hidden_effects import KINDS, NAMED, HiddenEffect, true_parameters
+from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import KINDS, NAMED, true_parameters
 from remaster_ros.types import FloatArray
 
 INDISTINGUISHABLE = 4.0

@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
 from worlds.hidden_world import HiddenTruth, HiddenWorld
 
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import FloatArray
 
 

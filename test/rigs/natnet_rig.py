@@ -11,7 +11,8 @@ from worlds.optitrack_world import SENSOR, MarkerWorld, eventually, free_port
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
 LOCAL = '127.0.0.1'
 NOISELESS = OptiTrackBehaviour(noise_across_m=0.0, noise_along_m=0.0)

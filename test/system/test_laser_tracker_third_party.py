@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along
 
+from remaster_ros.sensors.laser_tracker.codes import Command, Status
 from remaster_ros.sensors.laser_tracker.packets import (
-    Command,
     ErrorReport,
     Measurement,
     PacketReader,
     Reply,
     Request,
-    Status,
     StatusChange,
     encode,
 )
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
 
 packet = pytest.importorskip('CESAPI.packet', reason='the judge, PyPI CESAPI, is not installed')
 from CESAPI.command import CommandSync  # noqa: E402

@@ -26,10 +26,11 @@ from remaster_ros.sensors.optitrack import natnet as our_natnet
 from remaster_ros.sensors.optitrack import natnetclient_backend
 from remaster_ros.sensors.optitrack.driver import OptiTrackDriver, Parameters
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
-from remaster_ros.sensors.optitrack.natnet import LabeledMarker
+from remaster_ros.sensors.optitrack.natnet_frame import LabeledMarker
 from remaster_ros.sensors.optitrack.natnetclient_backend import NatNetClientBackend
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
 MARKER = np.array([0.3, -0.1, 2.0])
 TOOL = OptiTrackBehaviour()

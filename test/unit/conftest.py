@@ -14,7 +14,7 @@ import pytest
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import BasePrior, Measurements, Session
 

@@ -15,7 +15,8 @@ from judges.hidden_effects import judge, part_of
 from worlds.hidden_tours import visits, world
 from worlds.hidden_world import HiddenTruth, HiddenWorld, Noise
 
-from remaster_ros.simulation.hidden_effects import HiddenEffect, true_parameters
+from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import true_parameters
 
 STEP = HiddenEffect('slipped_joint', (3,), np.array([1e-3]), {'moment_s': 500.0})
 BENT = HiddenEffect(

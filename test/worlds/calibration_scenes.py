@@ -12,7 +12,7 @@ from remaster_ros.calibration.extension import Extension, Term
 from remaster_ros.kinematics.inverse_kinematics import InverseKinematics
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.types import Session
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from remaster_ros.importing.moving import MarkerStream, MovingOptions, moving_session
 from remaster_ros.importing.standstills import Stream
-from remaster_ros.sensors.optitrack.natnet import MEASURED
+from remaster_ros.sensors.optitrack.natnet_frame import MEASURED
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.arm_motion import ServoPoint
-from remaster_ros.simulation.optitrack import OptiTrackBehaviour, OptiTrackScene
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour, OptiTrackScene
 from remaster_ros.simulation.robot import FakeArm
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.world import START_S, World

@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 from worlds.hidden_world import HiddenTruth, HiddenWorld
 
-from remaster_ros.simulation.hidden_effects import Deviation, HiddenEffect, add_effect
+from remaster_ros.simulation.hidden_effect import Deviation, HiddenEffect
+from remaster_ros.simulation.hidden_effects import add_effect
 from remaster_ros.types import FloatArray
 
 OWN_ANGLE = ('encoder_eccentricity', 'encoder_scale', 'gear_periodic', 'joint_error_curve')

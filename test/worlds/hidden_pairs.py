@@ -32,7 +32,7 @@ from remaster_ros.planning.separating_design import (
 from remaster_ros.planning.tour_planner import TourPlanner
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.effect_sampling import draw_effect
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.simulation.world_model import Round
 from remaster_ros.types import Priors, Session
 

@@ -12,7 +12,7 @@ from worlds.hidden_tours import CANDIDATES, visits, world
 from worlds.hidden_world import MARKER_STD_M, HiddenTruth, HiddenWorld, Noise, Visits
 
 from remaster_ros.simulation.effect_sampling import draw_effect
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import Session
 
 NOISES = {

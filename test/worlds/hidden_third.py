@@ -20,7 +20,7 @@ from remaster_ros.discovery.discover import Discovery
 from remaster_ros.discovery.effects.context import Context, PartOfContext
 from remaster_ros.kinematics.transforms import apply, inverse
 from remaster_ros.reports.discovery_json import predictions_of
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.types import FloatArray, Session
 
 # A model whose error is so many times that of the offsets alone does harm.

@@ -19,7 +19,7 @@ from itertools import pairwise
 import numpy as np
 from worlds.hidden_arm import PinocchioArm
 
-from remaster_ros.simulation.hidden_effects import HiddenEffect
+from remaster_ros.simulation.hidden_effect import HiddenEffect
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.simulation.world_model import Round, WorldModel
 from remaster_ros.types import BoolArray, FloatArray, IntArray, Measurements, Session

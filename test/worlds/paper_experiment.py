@@ -11,7 +11,7 @@ import numpy as np
 
 from remaster_ros.kinematics.transforms import looking_at, transform
 from remaster_ros.session.cells.workcell import read_cell
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor
 from remaster_ros.types import FloatArray, Session
 

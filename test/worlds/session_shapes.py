@@ -12,7 +12,7 @@ from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, sensor
 
 from remaster_ros.kinematics.transforms import rotation_vector_to_matrix, transform
 from remaster_ros.session.records.reader import read_session
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.simulation.truth import SimulatedSensor
 from remaster_ros.types import Observation, Session
 

@@ -11,6 +11,16 @@ from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.types import BoolArray, FloatArray
 
+# What people read of joints that turn, and of those that slide: the unit, and how much of rad or m
+# makes one.
+_SHOWN = {False: ('°', np.radians(1.0)), True: ('mm', 1e-3)}
+# What drives where a joint turns, and its name where it slides.
+_OF_SLIDES = {
+    'own_angle': 'own_place',
+    'angle': 'place',
+    'gravity_torque': 'gravity_force',
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Driver:
@@ -39,9 +49,6 @@ class Driver:
         return Curve.of(self.value(context)[chosen], share, finest, turns_over)
 
 
-# What people read of joints that turn, and of those that slide: the unit, and how much of rad or m
-# makes one.
-_SHOWN = {False: ('°', np.radians(1.0)), True: ('mm', 1e-3)}
 TIME = Driver('time', 's', lambda context: context.elapsed_s, 'time', 'h', 3600.0)
 TEMPERATURE = Driver(
     'temperature', 'K', lambda context: context.warming, 'temperature above the first', 'K'
@@ -52,14 +59,6 @@ def slow_drivers(context: Context) -> list[Driver]:
     """Return the drivers that change over the session."""
     found = [TIME] if context.has_time else []
     return found + ([TEMPERATURE] if context.has_temperature else [])
-
-
-# What drives where a joint turns, and its name where it slides.
-_OF_SLIDES = {
-    'own_angle': 'own_place',
-    'angle': 'place',
-    'gravity_torque': 'gravity_force',
-}
 
 
 def driver_at(context: Context, joint: int, name: str) -> str:

@@ -25,6 +25,8 @@ from remaster_ros.discovery.effects.sizes import along_mean, angle, length, of_j
 from remaster_ros.types import FloatArray
 
 MOMENTS = 40
+# A belt or a coupling that slips by more is seen without a measurement.
+LARGEST_RAD = 2e-2
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
@@ -104,10 +106,6 @@ def _sensor_moved(
         arms = context.points - np.mean(context.centers[list(sensors)], axis=0)
         shifts += [np.cross(shift, arms) for shift in shifts]
     return displaced(*shifts)
-
-
-# A belt or a coupling that slips by more is seen without a measurement.
-LARGEST_RAD = 2e-2
 
 
 def _jump(context: Context, candidate: Candidate, draws: FloatArray) -> str:

@@ -16,8 +16,8 @@ import numpy as np
 from remaster_ros.errors import DeviceError
 from remaster_ros.parameters import parameter
 from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, TriggeredDriver
-from remaster_ros.sensors.laser_tracker.client import (
-    LaserTrackerClient,
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.link import (
     LaserTrackerError,
     LaserTrackerSettings,
     TrackerStatus,

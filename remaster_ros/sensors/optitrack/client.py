@@ -17,23 +17,22 @@ from collections.abc import Callable
 
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample, Source
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import MarkerFollower
-from remaster_ros.sensors.optitrack.natnet import (
+from remaster_ros.sensors.optitrack.natnet import Message, MessageId, ServerInfo
+from remaster_ros.sensors.optitrack.natnet_bytes import ProtocolError
+from remaster_ros.sensors.optitrack.natnet_frame import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,
-    Message,
-    MessageId,
-    ModelDefinition,
-    ProtocolError,
-    ServerInfo,
 )
+from remaster_ros.sensors.optitrack.natnet_model import ModelDefinition
 from remaster_ros.sensors.optitrack.settings import (
     NatNetSettings,
     open_multicast_socket,
     open_socket,
 )
+from remaster_ros.sensors.optitrack.source_lock import Source
 
 RETRY_S = 0.5
 KEEPALIVE_S = 1.0

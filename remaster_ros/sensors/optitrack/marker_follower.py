@@ -14,30 +14,17 @@ from typing import Literal
 import numpy as np
 
 from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.frame_gate import (
-    Dropped,
-    GateCounts,
-    MarkerGate,
-    MarkerSample,
-    Source,
-    SourceLock,
-    SourceVerdict,
-    describe,
-)
-from remaster_ros.sensors.optitrack.natnet import (
-    Frame,
-    ProtocolError,
-    ServerInfo,
-    Version,
-    encode_echo_request,
-    require_supported,
-)
+from remaster_ros.sensors.optitrack.frame_gate import Dropped, GateCounts, MarkerGate, MarkerSample
+from remaster_ros.sensors.optitrack.natnet import ServerInfo, encode_echo_request
+from remaster_ros.sensors.optitrack.natnet_bytes import ProtocolError, Version, require_supported
+from remaster_ros.sensors.optitrack.natnet_frame import Frame
 from remaster_ros.sensors.optitrack.settings import (
     NatNetSettings,
     interface_towards,
     port_is_closed,
     resolve,
 )
+from remaster_ros.sensors.optitrack.source_lock import Source, SourceLock, SourceVerdict, describe
 
 Fault = Literal[
     'none',
@@ -50,6 +37,8 @@ Fault = Literal[
     'marker',
     'silence',
 ]
+FOREIGN_REMEMBERED = 4
+_log = logging.getLogger('remaster_ros')
 
 
 @dataclass(kw_only=True)
@@ -267,11 +256,6 @@ def _no_marker(status: StreamStatus) -> Diagnosis:
 def _label(marker_id: int) -> str:
     """Id as asset:member."""
     return f'{marker_id >> 16}:{marker_id & 0xFFFF}'
-
-
-FOREIGN_REMEMBERED = 4
-
-_log = logging.getLogger('remaster_ros')
 
 
 class MarkerFollower(ABC):

@@ -22,13 +22,12 @@ from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerSample
 from remaster_ros.sensors.optitrack.marker_follower import Diagnosis, MarkerFollower
-from remaster_ros.sensors.optitrack.natnet import (
+from remaster_ros.sensors.optitrack.natnet_bytes import OLDEST_VERSION, ProtocolError
+from remaster_ros.sensors.optitrack.natnet_frame import (
     MODEL_FILLED,
     OCCLUDED,
-    OLDEST_VERSION,
     Frame,
     LabeledMarker,
-    ProtocolError,
 )
 from remaster_ros.sensors.optitrack.settings import NatNetSettings, open_socket
 

@@ -14,11 +14,7 @@ from remaster_ros.errors import DeviceError, InputError
 from remaster_ros.parameters import check_all, parameter
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.frame_gate import MarkerChoice
-from remaster_ros.sensors.optitrack.natnet import (
-    ProtocolError,
-    Version,
-    require_supported,
-)
+from remaster_ros.sensors.optitrack.natnet_bytes import ProtocolError, Version, require_supported
 
 RECEIVE_BUFFER_BYTES = 1 << 22
 """Receive buffer for a second of 1 kHz frames with 50 markers; Linux limits it by

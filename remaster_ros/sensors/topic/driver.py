@@ -23,6 +23,27 @@ from remaster_ros.parameters import parameter
 from remaster_ros.sensors.driver import SensorClock, SensorParameters, SensorState, StreamDriver
 from remaster_ros.types import FloatArray, MarkerReading
 
+POINT, POSE, MARKERS = (
+    'geometry_msgs/msg/PointStamped',
+    'geometry_msgs/msg/PoseStamped',
+    'mocap4r2_msgs/msg/Markers',
+)
+WAIT_S = 0.05
+"""Longest wait for a reading, s: a simulated world waits for this node, at most 0.15 s ahead."""
+SILENT_S = 1.0
+"""Time without a message, s of wall time, after which the topic counts as silent."""
+JUDGED = 200
+"""Largest number of messages for rate and standard deviation."""
+JUDGED_S = 1.0
+RATED_S = 3.0
+"""Largest age of these messages, s by their stamps, for the standard deviation (`JUDGED_S`) and
+the rate (`RATED_S`): messages at intervals above a second have a rate too."""
+EARLY_S = 0.1
+"""Largest lead of a stamp, s; a larger one means another clock. A simulated clock advances in
+steps, and a message may come before the step: there the lead may be as large as the age."""
+FROZEN = 10
+"""Number of successive positions, identical to the last bit, that are no measurements."""
+
 
 class Sighting(NamedTuple):
     """Content of a message about the marker."""
@@ -63,11 +84,6 @@ def _marker(message: Any, marker: str) -> Any:
     return None
 
 
-POINT, POSE, MARKERS = (
-    'geometry_msgs/msg/PointStamped',
-    'geometry_msgs/msg/PoseStamped',
-    'mocap4r2_msgs/msg/Markers',
-)
 READERS: dict[str, Callable[[Any, str], Sighting]] = {
     POINT: lambda message, marker: _sighting(message, message.point),
     POSE: lambda message, marker: _sighting(
@@ -76,23 +92,6 @@ READERS: dict[str, Callable[[Any, str], Sighting]] = {
     MARKERS: lambda message, marker: _sighting(message, _marker(message, marker)),
 }
 """Message type -> its reader; the second argument is the name or the number of the marker."""
-
-
-WAIT_S = 0.05
-"""Longest wait for a reading, s: a simulated world waits for this node, at most 0.15 s ahead."""
-SILENT_S = 1.0
-"""Time without a message, s of wall time, after which the topic counts as silent."""
-JUDGED = 200
-"""Largest number of messages for rate and standard deviation."""
-JUDGED_S = 1.0
-RATED_S = 3.0
-"""Largest age of these messages, s by their stamps, for the standard deviation (`JUDGED_S`) and
-the rate (`RATED_S`): messages at intervals above a second have a rate too."""
-EARLY_S = 0.1
-"""Largest lead of a stamp, s; a larger one means another clock. A simulated clock advances in
-steps, and a message may come before the step: there the lead may be as large as the age."""
-FROZEN = 10
-"""Number of successive positions, identical to the last bit, that are no measurements."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from worlds.session_shapes import repeats
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.residual_structure import ResidualStructure, residual_structure
-from remaster_ros.calibration.result import robust_std
+from remaster_ros.calibration.robust_std import robust_std
 from remaster_ros.calibration.smooth_functions import MOST_ROWS, spread_poses
 from remaster_ros.session.records.together import together
 from remaster_ros.simulation.effect_sampling import EffectSpec

@@ -16,7 +16,7 @@ import pytest
 from rigs import batch_jobs
 from rigs.command_line import refusal, remaster, run
 
-from remaster_ros.cli import batch
+from remaster_ros.cli import batch, batch_workers
 from remaster_ros.errors import InputError
 from remaster_ros.reports.batch_page import summary_of, write_batch_page
 from remaster_ros.session.records.journal import read_journal
@@ -55,7 +55,7 @@ def by_one(sessions, tmp_path_factory):
     given = [sessions / 's1', folder / 'copy', folder / 'empty']
     printed = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch, '_pool', ThreadPoolExecutor)
+        patch.setattr(batch, 'local_pool', ThreadPoolExecutor)
         for sessions_given in (given[:1], given[:1], given):
             if sessions_given == given:
                 Path(job.out).unlink()
@@ -94,7 +94,7 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
         assert (folder / file).read_bytes() == (other / file).read_bytes()
     before = (out / batch.ROWS).read_bytes()
     (out / batch.PAGE).unlink()
-    monkeypatch.setattr(batch, '_pool', ThreadPoolExecutor)
+    monkeypatch.setattr(batch, 'local_pool', ThreadPoolExecutor)
     said = remaster('batch', s1, out.parent / 'empty', '--out', out).stdout
     assert '1 done, 1 error' in said
     assert (out / batch.ROWS).read_bytes() == before, 'made again'
@@ -175,7 +175,7 @@ STARTS = """
 import sys, time
 from remaster_ros.cli import batch
 if __name__ == '__main__':
-    pool = batch._pool(1)
+    pool = batch_workers.local_pool(1)
     print(pool.submit(batch.os.getpid).result(), flush=True)
     time.sleep(600)
 """
@@ -206,11 +206,11 @@ def worked_off(jobs, work, workers=2):
     done, made = {}, []
 
     def make() -> Executor:
-        made.append(batch._pool(workers))
+        made.append(batch_workers.local_pool(workers))
         assert isinstance(made[-1], ProcessPoolExecutor)
         return made[-1]
 
-    batch.work_off(jobs, work, make, 2, lambda job, row: done.update({job: row}))
+    batch_workers.work_off(jobs, work, make, 2, lambda job, row: done.update({job: row}))
     return done, len(made)
 
 
@@ -243,10 +243,10 @@ def test_a_session_that_kills_its_worker_twice_has_that_in_its_row():
 )
 def test_a_scheduler_on_another_computer_takes_tls(address, insecure, refused):
     if not refused:
-        batch._refuse_open(address, insecure=insecure)
+        batch_workers.refuse_open(address, insecure=insecure)
         return
     with pytest.raises(batch.InputError, match='without TLS'):
-        batch._refuse_open(address, insecure=insecure)
+        batch_workers.refuse_open(address, insecure=insecure)
 
 
 @pytest.fixture
@@ -295,9 +295,9 @@ def test_a_scheduler_that_ends_is_one_line():
         jobs = [0.2 + 0.001 * i for i in range(50)]
         with (
             pytest.raises(batch.InputError, match='the scheduler has ended'),
-            batch._scheduler(address, insecure=False) as (executor, workers),
+            batch_workers.scheduled(address, insecure=False) as (executor, workers),
         ):
-            batch.work_off(jobs, time.sleep, lambda: executor, 2 * workers, finished)
+            batch_workers.work_off(jobs, time.sleep, lambda: executor, 2 * workers, finished)
     assert 2 <= len(done) < 50
 
 
@@ -305,7 +305,7 @@ def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
     monkeypatch.setattr(batch, '_version', other_version)
     with (
         pytest.raises(batch.InputError, match=r'has remaster_ros 0\.0\.1'),
-        batch._scheduler(scheduler.scheduler_address, insecure=False),
+        batch_workers.scheduled(scheduler.scheduler_address, insecure=False),
     ):
         pass
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from pairing_feed import STREAM, Q
 
-from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection, of_the_marker
+from remaster_ros.collection.pairing import PairedReading, Pairing, Rejection
+from remaster_ros.collection.still_frames import of_the_marker
 from remaster_ros.types import MarkerReading
 
 TRUE = np.array([0.3, -0.2, 2.5])

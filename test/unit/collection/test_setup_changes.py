@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from remaster_ros.collection.pairing import PairedReading
-from remaster_ros.collection.reference_watch import SetupChanges
+from remaster_ros.collection.setup_changes import SetupChanges
 from remaster_ros.kinematics import transforms
 from remaster_ros.session.cells.workcell import read_cell
 

@@ -39,7 +39,7 @@ from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import System, solve
 from remaster_ros.discovery.words import p_value_text, percent
 from remaster_ros.errors import InputError, InsufficientDataError
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 from remaster_ros.types import Session
 
 ARC_MINUTE = np.radians(1.0 / 60.0)

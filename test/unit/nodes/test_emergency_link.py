@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
 from remaster_ros.nodes import robot_bridge
-from remaster_ros.nodes.robot_bridge import EmergencyLink
+from remaster_ros.nodes.emergency_link import EmergencyLink
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from remaster_ros.nodes import runtime_files
-from remaster_ros.nodes.runtime_files import opening_file, opening_path, page_name
+from remaster_ros.nodes.opening_file import opening_file, opening_path, page_name
 
 
 @pytest.fixture(autouse=True)

@@ -12,7 +12,8 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.nodes import runtime_files
-from remaster_ros.nodes.runtime_files import NameLock, page_name
+from remaster_ros.nodes.opening_file import page_name
+from remaster_ros.nodes.runtime_files import NameLock
 from remaster_ros.simulation.setup import default_folder
 
 HOLD = """

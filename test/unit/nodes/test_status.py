@@ -21,7 +21,8 @@ from remaster_ros.collection.events import (
     encode,
 )
 from remaster_ros.nodes import status
-from remaster_ros.nodes.status import EVENTS, RELIABLE, NodeStatus, Summary, listen, node_of, pairs
+from remaster_ros.nodes.qos import node_of
+from remaster_ros.nodes.status import EVENTS, RELIABLE, NodeStatus, Summary, listen, pairs
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
 HALT = 'the robot does not follow'

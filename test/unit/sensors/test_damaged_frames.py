@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from remaster_ros.collection.pairing import PairedReading, Pairing, SensorRules
-from remaster_ros.sensors.optitrack import natnet
+from remaster_ros.sensors.optitrack import natnet, natnet_bytes
 from remaster_ros.sensors.optitrack.frame_gate import GateCounts, MarkerChoice, MarkerGate
-from remaster_ros.sensors.optitrack.natnet import Frame, LabeledMarker
+from remaster_ros.sensors.optitrack.natnet_frame import Frame, LabeledMarker
 from remaster_ros.types import MarkerReading
 
 VERSION, MARKER, TICKS_PER_S = (3, 1), 1 << 16 | 1, 10_000_000
@@ -57,7 +57,7 @@ class Bar:
             data = damaged(self.rng, data)
         try:
             message = natnet.decode_message(data, VERSION)
-        except natnet.ProtocolError:
+        except natnet_bytes.ProtocolError:
             return position, None
         if not isinstance(message, Frame):
             return position, None

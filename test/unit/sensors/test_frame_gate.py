@@ -8,7 +8,7 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, GateCounts, MarkerChoice, MarkerGate
-from remaster_ros.sensors.optitrack.natnet import NOT_LIVE, Frame, LabeledMarker
+from remaster_ros.sensors.optitrack.natnet_frame import NOT_LIVE, Frame, LabeledMarker
 
 MARKER_ID = 3 << 16 | 2
 MEASURED_ASSET, STRAY = 0x0A, 0x12

@@ -3,7 +3,7 @@
 
 import pytest
 
-from remaster_ros.sensors.optitrack.frame_gate import (
+from remaster_ros.sensors.optitrack.source_lock import (
     PROBATION_S,
     REFUSED_FOR_S,
     REMEMBERED,

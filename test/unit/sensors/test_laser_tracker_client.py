@@ -13,14 +13,15 @@ from worlds.optitrack_world import nothing_left
 from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along, wait_for
 
 from remaster_ros.errors import DeviceError, InputError
-from remaster_ros.sensors.laser_tracker.client import (
-    LaserTrackerClient,
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.codes import Status
+from remaster_ros.sensors.laser_tracker.link import (
     LaserTrackerError,
     LaserTrackerSettings,
     TrackerStatus,
 )
-from remaster_ros.sensors.laser_tracker.packets import Status
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
 
 QUICK = TrackerBehaviour(warm_up_s=0.5, initialise_s=0.5, search_failure_share=0.0)
 

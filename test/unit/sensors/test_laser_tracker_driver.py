@@ -8,7 +8,8 @@ from worlds.tracker_world import MARKER, OTHER_BESIDE, ReflectorWorld
 from remaster_ros.errors import DeviceError
 from remaster_ros.sensors.driver import SensorClock
 from remaster_ros.sensors.laser_tracker.driver import LaserTrackerDriver, Parameters
-from remaster_ros.simulation.laser_tracker import FakeLaserTracker, TrackerBehaviour
+from remaster_ros.simulation.laser_tracker import FakeLaserTracker
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
 
 QUICK = TrackerBehaviour(warm_up_s=0.1, initialise_s=0.1, search_failure_share=0.0)
 NEAR_M = 0.2e-3

@@ -13,15 +13,11 @@ import pytest
 from worlds.tracker_world import wait_for
 
 from remaster_ros.errors import DeviceError
-from remaster_ros.sensors.laser_tracker.client import (
-    LaserTrackerClient,
-    LaserTrackerError,
-    LaserTrackerSettings,
-)
+from remaster_ros.sensors.laser_tracker.client import LaserTrackerClient
+from remaster_ros.sensors.laser_tracker.codes import Change, Command
+from remaster_ros.sensors.laser_tracker.link import LaserTrackerError, LaserTrackerSettings
 from remaster_ros.sensors.laser_tracker.packets import (
     NEED_DATA,
-    Change,
-    Command,
     ErrorReport,
     Event,
     Measurement,

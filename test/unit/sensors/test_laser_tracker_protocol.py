@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from remaster_ros.sensors.laser_tracker.codes import Command, Status, describe_status
 from remaster_ros.sensors.laser_tracker.packets import (
     MAX_PACKET_SIZE,
     NEED_DATA,
-    Command,
     ConnectionClosed,
     ErrorReport,
     Event,
@@ -20,10 +20,8 @@ from remaster_ros.sensors.laser_tracker.packets import (
     ProtocolError,
     Reply,
     Request,
-    Status,
     StatusChange,
     UnknownPacket,
-    describe_status,
     encode,
 )
 

@@ -15,7 +15,7 @@ from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import OptiTrackBehaviour
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
 
 @pytest.fixture

@@ -22,7 +22,8 @@ from remaster_ros.sensors.optitrack.client import NatNetClient
 from remaster_ros.sensors.optitrack.frame_gate import Dropped
 from remaster_ros.sensors.optitrack.marker_follower import warning
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
-from remaster_ros.simulation.optitrack import FakeOptiTrackServer, OptiTrackBehaviour
+from remaster_ros.simulation.optitrack import FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour
 
 LOCAL = '127.0.0.1'
 HERE, FORGED = 2.0, 2.003

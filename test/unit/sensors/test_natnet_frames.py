@@ -11,13 +11,13 @@ from hostile.fuzz_messages import VERSIONS, full_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack.natnet import (
+from remaster_ros.sensors.optitrack.natnet_bytes import ProtocolError
+from remaster_ros.sensors.optitrack.natnet_frame import (
     MEASURED,
     OCCLUDED,
     TRACKING_VALID,
     Frame,
     LabeledMarker,
-    ProtocolError,
     RigidBody,
     decode_frame,
     encode_frame,

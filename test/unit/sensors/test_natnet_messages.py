@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.natnet import (
-    Frame,
+from remaster_ros.sensors.optitrack import natnet, natnet_model
+from remaster_ros.sensors.optitrack.natnet import MessageId
+from remaster_ros.sensors.optitrack.natnet_bytes import ProtocolError
+from remaster_ros.sensors.optitrack.natnet_frame import Frame
+from remaster_ros.sensors.optitrack.natnet_model import (
     MarkerSetDescription,
-    MessageId,
     ModelDefinition,
     OtherDescription,
-    ProtocolError,
     RigidBodyDescription,
 )
 
@@ -200,9 +200,9 @@ def test_descriptions_of_other_kinds_are_walked_over(version):
     for kind, body in kinds:
         size = struct.pack('<i', len(body)) if version >= (4, 1) else b''
         payload += struct.pack('<i', kind) + size + body
-    only_tool = natnet.encode_model_definition(ModelDefinition((tool(version),)), version)
+    only_tool = natnet_model.encode_model_definition(ModelDefinition((tool(version),)), version)
     payload += only_tool[4:]
-    definition = natnet.decode_model_definition(payload, version)
+    definition = natnet_model.decode_model_definition(payload, version)
     expected = [
         *((2, 'person', 4), (3, 'SN8', 8), (4, 'DAQ', 9), (5, 'Camera 1', None)),
         (6, 'leg', 12),
@@ -217,12 +217,12 @@ def test_descriptions_of_other_kinds_are_walked_over(version):
 
 def test_a_description_of_an_unknown_kind_is_skipped_where_its_size_is_known():
     unknown = struct.pack('<2i', 77, 3) + b'abc'
-    only_tool = natnet.encode_model_definition(ModelDefinition((tool((4, 1)),)), (4, 1))
+    only_tool = natnet_model.encode_model_definition(ModelDefinition((tool((4, 1)),)), (4, 1))
     payload = struct.pack('<i', 2) + unknown + only_tool[4:]
-    definition = natnet.decode_model_definition(payload, (4, 1))
+    definition = natnet_model.decode_model_definition(payload, (4, 1))
     assert definition.descriptions == (OtherDescription(77, ''), tool((4, 1)))
     with pytest.raises(ProtocolError, match='unknown kind 77'):
-        natnet.decode_model_definition(struct.pack('<2i', 1, 77), (3, 1))
+        natnet_model.decode_model_definition(struct.pack('<2i', 1, 77), (3, 1))
 
 
 def test_what_cannot_be_encoded_is_refused_by_the_sender():
@@ -231,7 +231,7 @@ def test_what_cannot_be_encoded_is_refused_by_the_sender():
     with pytest.raises(ValueError, match='65503'):
         natnet.join_datagram(7, bytes(65504))
     with pytest.raises(ValueError, match='cannot be encoded'):
-        natnet.encode_model_definition(ModelDefinition((OtherDescription(5, 'c'),)), (4, 1))
+        natnet_model.encode_model_definition(ModelDefinition((OtherDescription(5, 'c'),)), (4, 1))
     with pytest.raises(ValueError, match='how it streams'):
         natnet.encode_message(natnet.ServerInfo('x', (1, 0, 0, 0), (3, 1)), (3, 1))
 

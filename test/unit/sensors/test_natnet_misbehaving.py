@@ -15,14 +15,13 @@ from remaster_ros.sensors.optitrack import client as natnet_client
 from remaster_ros.sensors.optitrack import natnet
 from remaster_ros.sensors.optitrack.client import NatNetClient, _is_of_others
 from remaster_ros.sensors.optitrack.frame_gate import Dropped, MarkerChoice
-from remaster_ros.sensors.optitrack.natnet import (
+from remaster_ros.sensors.optitrack.natnet_frame import (
     BITSTREAM_CHANGED,
     MODEL_LIST_CHANGED,
     Frame,
     LabeledMarker,
-    ModelDefinition,
-    RigidBodyDescription,
 )
+from remaster_ros.sensors.optitrack.natnet_model import ModelDefinition, RigidBodyDescription
 from remaster_ros.sensors.optitrack.settings import NatNetSettings
 
 

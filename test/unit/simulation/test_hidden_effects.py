@@ -12,9 +12,11 @@ from remaster_ros.kinematics.transforms import transform
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.yaml_records import from_plain, to_plain
 from remaster_ros.simulation.arm_motion import ServoPoint
+from remaster_ros.simulation.chain_arm import ChainArm
 from remaster_ros.simulation.effect_sampling import RANDOM, EffectSpec, hide
-from remaster_ros.simulation.hidden_arm import ChainArm, TrueArm
-from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED, HiddenEffect
+from remaster_ros.simulation.hidden_arm import TrueArm
+from remaster_ros.simulation.hidden_effect import HiddenEffect
+from remaster_ros.simulation.hidden_effects import NAMED, UNNAMED
 from remaster_ros.simulation.setup import make_world
 from remaster_ros.simulation.truth import SessionTruth, SimulatedSensor, Warming
 from remaster_ros.simulation.world import World

@@ -7,19 +7,17 @@ import numpy as np
 import pytest
 from worlds.tracker_world import MARKER, ReflectorWorld, across_and_along
 
+from remaster_ros.sensors.laser_tracker.codes import Change, Command, Readiness, Status
 from remaster_ros.sensors.laser_tracker.packets import (
-    Change,
-    Command,
     ErrorReport,
     Event,
     Measurement,
-    Readiness,
     Reply,
     Request,
-    Status,
     StatusChange,
 )
-from remaster_ros.simulation.laser_tracker import TrackerBehaviour, TrackerInstrument
+from remaster_ros.simulation.laser_tracker_behaviour import TrackerBehaviour
+from remaster_ros.simulation.laser_tracker_instrument import TrackerInstrument
 
 SURE = TrackerBehaviour(search_failure_share=0.0)
 METRES = Request(Command.SET_UNITS, (0, 0, 0, 0, 0))

@@ -10,14 +10,11 @@ import pytest
 from worlds.optitrack_world import SENSOR, MarkerWorld, SteppedWorld, free_port
 
 from remaster_ros.errors import InputError
-from remaster_ros.sensors.optitrack import natnet
-from remaster_ros.sensors.optitrack.natnet import TRACKING_VALID, Frame, MessageId
-from remaster_ros.simulation.optitrack import (
-    MAX_CLIENTS,
-    FakeOptiTrackServer,
-    OptiTrackBehaviour,
-    OptiTrackScene,
-)
+from remaster_ros.sensors.optitrack import natnet, natnet_bytes, natnet_model
+from remaster_ros.sensors.optitrack.natnet import MessageId
+from remaster_ros.sensors.optitrack.natnet_frame import TRACKING_VALID, Frame
+from remaster_ros.simulation.optitrack import MAX_CLIENTS, FakeOptiTrackServer
+from remaster_ros.simulation.optitrack_scene import OptiTrackBehaviour, OptiTrackScene
 
 SEED = 20
 CALIBRATION_ID = 1 << 16 | 1
@@ -142,7 +139,7 @@ class Asker:
     def wait_for(self, kind):
         """Read on; frames of another bitstream may be on their way and do not decode."""
         while True:
-            with contextlib.suppress(natnet.ProtocolError):
+            with contextlib.suppress(natnet_bytes.ProtocolError):
                 message = natnet.decode_message(self.socket.recv(65536), self.version)
                 if isinstance(message, kind):
                     return message
@@ -168,7 +165,7 @@ def test_the_command_channel_answers_what_clients_ask(unicast_server):
         assert asker.ask(natnet.encode_echo_request(78), natnet.EchoResponse).server_clock > (
             echo.server_clock
         )
-        model = asker.ask(struct.pack('<2H', 4, 0) + b'\0', natnet.ModelDefinition)
+        model = asker.ask(struct.pack('<2H', 4, 0) + b'\0', natnet_model.ModelDefinition)
         assert model.labelled_assets == {'tool': 1}
         assert model.rigid_bodies[0].marker_names[0] == 'tool_1'
         assert asker.ask(natnet.join_datagram(MessageId.REQUEST_FRAMEOFDATA), Frame)

@@ -10,7 +10,7 @@ from worlds.calibration_scenes import CHAIN, MARKERS, URDF, random_poses, scene,
 
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 
 
 def test_without_noise_it_measures_the_true_robot() -> None:

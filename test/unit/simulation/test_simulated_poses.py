@@ -19,7 +19,7 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.transforms import inverse, inverse_poses, transform
 from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
-from remaster_ros.simulation.simulated_workcell import simulate_session
+from remaster_ros.simulation.simulated_session import simulate_session
 
 ERROR_RATE = 1e-3
 TURN = np.radians(0.02)

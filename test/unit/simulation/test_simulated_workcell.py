@@ -9,7 +9,7 @@ import pytest
 from remaster_ros.errors import InputError
 from remaster_ros.planning.candidates import order_solutions
 from remaster_ros.session.cells.workcell import read_cell
-from remaster_ros.simulation import simulated_workcell
+from remaster_ros.simulation import simulated_tour, simulated_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 
 ROOT = Path(__file__).parents[3]
@@ -86,13 +86,13 @@ def planned(cell):
     counts = {'optimization': 12, 'validation': 6}
     sensors = place_all(cell, 5)
     places = {name: sensor.T_R_N for name, sensor in sensors.items()}
-    tour = simulated_workcell.plan_tour(chain, cell, places, counts, np.random.default_rng(5))
+    tour = simulated_tour.plan_tour(chain, cell, places, counts, np.random.default_rng(5))
     return chain, sensors, tour
 
 
 def test_every_planned_solution_is_visited_nearest_first(planned):
     chain, _, tour = planned
-    visits = simulated_workcell.visit(tour, chain)
+    visits = simulated_tour.visit(tour, chain)
     q = np.zeros(len(chain))
     for split, poses in visits.items():
         assert len(poses) == tour.poses[split] > 0
@@ -107,7 +107,7 @@ def test_every_planned_solution_is_visited_nearest_first(planned):
 
 def test_the_tool_faces_the_sensor_it_aims_at(planned):
     chain, sensors, tour = planned
-    for poses in simulated_workcell.visit(tour, chain).values():
+    for poses in simulated_tour.visit(tour, chain).values():
         for solutions in poses:
             T = chain.forward(solutions[0])
             line = sensors['tracker'].T_R_N[:3, 3] - T[:3, 3]
@@ -117,7 +117,7 @@ def test_the_tool_faces_the_sensor_it_aims_at(planned):
 def test_ranges_out_of_reach_are_refused(cell):
     cell.poses.radius_m = (4.0, 5.0)
     with pytest.raises(InputError, match=r'dropped poses: 5 out of reach: no pose is left'):
-        simulated_workcell.plan_tour(
+        simulated_tour.plan_tour(
             cell.chain(),
             cell,
             {name: sensor.T_R_N for name, sensor in place_all(cell, 1).items()},

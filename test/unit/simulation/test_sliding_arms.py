@@ -16,7 +16,8 @@ from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.records.reader import read_session
 from remaster_ros.simulation.effect_sampling import EffectSpec
-from remaster_ros.simulation.simulated_workcell import simulate_session, simulate_workcell
+from remaster_ros.simulation.simulated_session import simulate_session
+from remaster_ros.simulation.simulated_workcell import simulate_workcell
 from remaster_ros.simulation.truth import SimulatedSensor, place_sensor
 
 ERROR_RATE = 1e-3

@@ -15,15 +15,14 @@ from worlds.optitrack_world import SENSOR, MarkerWorld
 from remaster_ros.simulation import world_clock
 from remaster_ros.simulation import world_clock as pace_module
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
-from remaster_ros.simulation.world_clock import (
+from remaster_ros.simulation.world_clock import HELD_WALL_S, WorldClock
+from remaster_ros.simulation.world_pace import (
     AHEAD_S,
     AHEAD_WALL_S,
-    HELD_WALL_S,
     LEAD_AHEAD_S,
     LEAD_PATIENCE_WALL_S,
     PATIENCE_WALL_S,
     Pace,
-    WorldClock,
 )
 
 START_S, RATE, ME = 1000.0, 10.0, os.getpid()
