@@ -69,8 +69,8 @@ def _coverage(outcomes: Sequence[Outcome]) -> str:
     rows = []
     by_name: dict[str, list[bool]] = {}
     for outcome in outcomes:
-        for name, held in outcome.inside.items():
-            by_name.setdefault(name, []).append(held)
+        for name, is_inside in outcome.inside.items():
+            by_name.setdefault(name, []).append(is_inside)
     for kind in dict.fromkeys(map(kind_of, by_name)):
         names = [name for name in by_name if kind_of(name) == kind]
         shares = [float(np.mean(by_name[name])) for name in names]

@@ -58,24 +58,28 @@ def _line(kind: str, number: int, multiple: float) -> tuple[Any, ...]:
     except RemasterError as error:
         return name, 'refused', '', str(error).replace('|', '/'), ''
     seconds = time.process_time() - started
-    named = [f'{one.title} ({one.probability:.2f})'.replace('|', '/') for one in found.effects]
-    named += [f'? {one.where} {one.driver}' for one in found.unexplained]
+    named = [
+        f'{effect.title} ({effect.probability:.2f})'.replace('|', '/') for effect in found.effects
+    ]
+    named += [f'? {error_kind.where} {error_kind.driver}' for error_kind in found.unexplained]
     return name, outcome(hidden, found), found.verdict, '; '.join(named), f'{seconds:.1f}'
 
 
 def outcome(hidden: Changing, found: Any) -> str:
     """Return 'right', 'unsure' where no cause is certain, 'beside' or 'wrong'."""
-    certain = [one for one in found.effects if one.is_certain]
-    for one in found.effects:
-        if one.name != hidden.kind or (hidden.joints and not {*hidden.joints} & {*one.joints}):
+    certain = [effect for effect in found.effects if effect.is_certain]
+    for effect in found.effects:
+        if effect.name != hidden.kind or (
+            hidden.joints and not {*hidden.joints} & {*effect.joints}
+        ):
             continue
         is_dated = (
-            one.moment_s is not None
-            and abs(one.moment_s - hidden.moment_s) <= WITHIN * hidden.duration_s
+            effect.moment_s is not None
+            and abs(effect.moment_s - hidden.moment_s) <= WITHIN * hidden.duration_s
         )
         if is_dated:
-            others = [e for e in certain if e.name != hidden.kind]
-            return 'right' if not others else 'beside'
+            further_effects = [e for e in certain if e.name != hidden.kind]
+            return 'right' if not further_effects else 'beside'
     return 'wrong' if certain and not found.unexplained else 'unsure'
 
 

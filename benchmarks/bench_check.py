@@ -69,25 +69,25 @@ def main() -> None:
     args = parser.parse_args()
     rows = []
     for kind in args.kinds:
-        changed, told, named, again, open_ = [], [], 0, 0, 0
+        changed, days, named, again, open_ = [], [], 0, 0, 0
         for seed in range(FIRST_SEED, FIRST_SEED + args.arms):
             said, joint = of_arm(seed, kind, args.season_std)
-            again += sum(one.again for _, one in said)
-            calls = [day for day, one in said if one.verdict in ('changed', 'setup_moved')]
+            again += sum(result.again for _, result in said)
+            calls = [day for day, result in said if result.verdict in ('changed', 'setup_moved')]
             ends = [
-                (day, one)
-                for day, one in said
-                if one.trend is not None or one.changed or one.verdict == 'setup_moved'
+                (day, result)
+                for day, result in said
+                if result.trend is not None or result.changed or result.verdict == 'setup_moved'
             ]
             changed += calls[:1]
-            told += [ends[0][0]] if ends else []
+            days += [ends[0][0]] if ends else []
             if ends:
                 last = ends[-1][1]
                 named += joint in (last.changed or (last.trend.joints if last.trend else ()))
             last = said[-1][1]
             open_ += last.verdict == 'unclear' and last.trend is None and not last.changed
         rows.append(
-            (kind, args.arms, len(told), _median(told, kind), len(changed), _median(changed, kind),
+            (kind, args.arms, len(days), _median(days, kind), len(changed), _median(changed, kind),
              named, open_, again)
         )  # fmt: skip
     head = ('arms', 'count', 'told', 'days until', 'changed', 'days until', 'joint named')

@@ -107,7 +107,7 @@ def judge(hidden: HiddenSession, compensator: Compensator, tour: Visits) -> dict
     off = seen['true'] - wanted
     square = np.einsum('ni,ni->n', off, np.linalg.solve(covariance, off[..., None])[..., 0])
     return {
-        **{key: 1e3 * float(np.sqrt(np.mean(one**2))) for key, one in errors.items()},
+        **{key: 1e3 * float(np.sqrt(np.mean(values**2))) for key, values in errors.items()},
         'median': 1e3 * float(np.median(errors['true'])),
         'predicted': 1e3 * float(np.sqrt(np.mean(np.trace(covariance, axis1=1, axis2=2)))),
         'inside': float(np.mean(square < IN_95)),
@@ -129,7 +129,7 @@ def main() -> None:
         for seed in range(args.seeds)
     }
     done = known(args.results)
-    todo = {name: one for name, one in wanted.items() if name not in done}
+    todo = {name: entry for name, entry in wanted.items() if name not in done}
     for line in resumed(args.results, todo, run, args.jobs):
         done[line['name']] = line
         print(line['name'], line['verdict'], f'{line["seconds"]:.0f} s', flush=True)
@@ -146,14 +146,14 @@ def main() -> None:
             for where in ('measured', 'random'):
                 mine = [line[where] for line in lines]
                 for key in ('before', 'command', 'true', 'median', 'predicted'):
-                    row.append(f'{np.sqrt(np.mean([one[key] ** 2 for one in mine])):.3f}')
-                row.append(f'{np.mean([one["inside"] for one in mine]):.3f}')
+                    row.append(f'{np.sqrt(np.mean([entry[key] ** 2 for entry in mine])):.3f}')
+                row.append(f'{np.mean([entry["inside"] for entry in mine]):.3f}')
             rows.append(row)
     print(table(header, rows))
     for where in ('measured', 'random'):
         every = [done[name][where] for name in wanted]
-        true = np.array([one['true'] for one in every])
-        inside = np.mean([one['inside'] for one in every])
+        true = np.array([entry['true'] for entry in every])
+        inside = np.mean([entry['inside'] for entry in every])
         print(
             f'{where}: RMS {np.sqrt(np.mean(true**2)):.3f} mm, above 0.05 mm '
             f'{np.sum(true > 0.05)} of {len(true)}; in 95 % {inside:.3f}'

@@ -224,8 +224,8 @@ def _run(item: tuple[str, Recipe]) -> dict[str, Any]:
 
 
 def _cause(cause: tuple[str, tuple[int, ...], str]) -> str:
-    name, joints, rest = cause
-    return ' '.join(part for part in (name, ','.join(map(str, joints)), rest) if part)
+    name, joints, driver = cause
+    return ' '.join(part for part in (name, ','.join(map(str, joints)), driver) if part)
 
 
 def main() -> None:

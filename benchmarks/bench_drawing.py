@@ -50,14 +50,14 @@ def inside(seed: int, tolerance_m: float) -> tuple[float, BoolArray, BoolArray]:
     priors = Priors(geometry_tolerance_m=tolerance_m)
     result = fit_session(session, rng=np.random.default_rng(seed), priors=priors)
     known = result.identifiable
-    held = [
+    hits = [
         (
             (interval[:, 0] <= made.truth.joint_offsets)
             & (made.truth.joint_offsets <= interval[:, 1])
         )
         for interval in (uncertainty(result).interval95, result.joint_offsets_interval95)
     ]
-    return off, held[0][known], held[1][known]
+    return off, hits[0][known], hits[1][known]
 
 
 def main() -> None:
@@ -70,10 +70,10 @@ def main() -> None:
     found = [inside(seed, 1e-3 * args.tolerance_mm) for seed in seeds]
     rows = []
     for low, high in ((0.1, 0.4), (0.4, 0.7), (0.7, 1.0), (0.1, 1.0)):
-        mine = [one for one in found if low <= 1e3 * abs(one[0]) <= high]
+        mine = [entry for entry in found if low <= 1e3 * abs(entry[0]) <= high]
         if not mine:
             continue
-        shown, narrow = (np.concatenate([one[k] for one in mine]) for k in (1, 2))
+        shown, narrow = (np.concatenate([entry[k] for entry in mine]) for k in (1, 2))
         rows.append(
             (f'{low} to {high}', len(mine), len(shown), f'{100 * shown.mean():.1f} %',
              f'{100 * narrow.mean():.1f} %')

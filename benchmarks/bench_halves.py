@@ -119,15 +119,15 @@ def difference_std(halves: list[Half]) -> FloatArray:
     total = np.zeros(joints)
     responses = []
     for half in halves:
-        one = half.unmodelled
+        unmodelled = half.unmodelled
         rows = np.full(joints, -1)
-        mine = one.where < joints
-        rows[one.where[mine]] = np.flatnonzero(mine)
-        estimator = (one.root[rows] @ one.root.T) @ one.white.T
-        columns = one.data.columns(shared)
-        white = one.data.noise_model.whitened(columns, one.solution.noise)
-        free = one.found.posterior.free
-        base = one.white[:, : len(free)]
+        mine = unmodelled.where < joints
+        rows[unmodelled.where[mine]] = np.flatnonzero(mine)
+        estimator = (unmodelled.root[rows] @ unmodelled.root.T) @ unmodelled.white.T
+        columns = unmodelled.data.columns(shared)
+        white = unmodelled.data.noise_model.whitened(columns, unmodelled.solution.noise)
+        free = unmodelled.found.posterior.free
+        base = unmodelled.white[:, : len(free)]
         responses.append(
             np.concatenate((estimator @ base, estimator @ white.reshape(len(base), -1)), axis=1)
         )
@@ -142,10 +142,12 @@ def _shared(halves: list[Half]) -> tuple[list[Candidate], FloatArray]:
     Those of the offsets model first: what has a flat prior is in both halves as it is, and has no
     variance here.
     """
-    one = halves[0].unmodelled
-    x = one.found.model.natural(one.found.mode.z)
-    free = one.found.posterior.free
-    rows = prior_rows(one.found.model, one.found.posterior.priors, x, natural=True)[1][:, free]
+    unmodelled = halves[0].unmodelled
+    x = unmodelled.found.model.natural(unmodelled.found.mode.z)
+    free = unmodelled.found.posterior.free
+    rows = prior_rows(unmodelled.found.model, unmodelled.found.posterior.priors, x, natural=True)[
+        1
+    ][:, free]
     blocks = [np.linalg.pinv(rows.T @ rows, rcond=1e-10)]
     shared: list[Candidate] = []
     names: set[str] = set()
@@ -156,7 +158,7 @@ def _shared(halves: list[Half]) -> tuple[list[Candidate], FloatArray]:
                 blocks.append(variance)
                 names |= {*candidate.parameters}
     for candidate, variance in _of_drawing(
-        one.data, one.found.problem.priors.geometry_tolerance_m
+        unmodelled.data, unmodelled.found.problem.priors.geometry_tolerance_m
     ):
         if names.isdisjoint(candidate.parameters):
             shared.append(candidate)
@@ -204,12 +206,12 @@ def run(item: tuple[str, Split]) -> dict[str, Any]:
         rows = np.flatnonzero(np.isin(session.measurements.pose, part))
         halves.append(half_of(session.select(rows), seed))
     seconds = time.process_time() - started
-    one, other = (half.found.fit for half in halves)
+    fit, other = (half.found.fit for half in halves)
     # Joints that only the prior decides are not told apart by halves.
-    known_to = np.maximum(one.joint_offsets_std, other.joint_offsets_std)
+    known_to = np.maximum(fit.joint_offsets_std, other.joint_offsets_std)
     both = known_to < OPEN_ANGLE * halves[0].unmodelled.found.problem.chain.per_radian
-    apart = (one.joint_offsets - other.joint_offsets)[both]
-    stated = np.hypot(one.joint_offsets_std, other.joint_offsets_std)[both]
+    differences = (fit.joint_offsets - other.joint_offsets)[both]
+    stated = np.hypot(fit.joint_offsets_std, other.joint_offsets_std)[both]
     again = [
         [key, mine.probability[key], theirs.probability.get(key, 0.0)]
         for mine, theirs in (halves, halves[::-1])
@@ -217,8 +219,8 @@ def run(item: tuple[str, Split]) -> dict[str, Any]:
     ]
     return {
         'name': name,
-        'offsets': (apart / difference_std(halves)[both]).tolist(),
-        'stated': (apart / stated).tolist(),
+        'offsets': (differences / difference_std(halves)[both]).tolist(),
+        'stated': (differences / stated).tolist(),
         'causes': again,
         'verdicts': [half.found.verdict for half in halves],
         'seconds': seconds,

@@ -141,7 +141,7 @@ def verdicts(count: int) -> str:
     return (
         f'Fits of {count} of these sessions without their velocities: {listed}. CPU of '
         f'`fit_session` {np.mean(fits):.1f} s (at most {max(fits):.1f}), of `discover_session` '
-        f'{", ".join(f"{one:.1f}" for one in discoveries)} s.'
+        f'{", ".join(f"{cpu_s:.1f}" for cpu_s in discoveries)} s.'
     )
 
 
@@ -172,16 +172,16 @@ def of_fakes(count: int, scale: float, first: int) -> str:
 
 def stop_and_go(count: int) -> str:
     """Return how offsets by moving frames of stop-and-go recordings agree with those at rest."""
-    apart = []
+    scores = []
     for seed in range(5000, 5000 + count):
         world, recording = recorded(seed, seconds=18.0, stops=True)
         session, _ = imported(world, recording)
         moving, std = inner(estimate_moving(Problem.of(session)))
         still, still_std = inner(estimate(Problem.of(standing(world, recording))))
-        apart.append((moving - still) / np.hypot(std, still_std))
+        scores.append((moving - still) / np.hypot(std, still_std))
     return (
         f'Moving frames of {count} stop-and-go recordings (some 22 stops, seeds from 5000) and '
-        f'their standstills: RMS z of the differences of offsets {_rms(np.array(apart)):.2f}.'
+        f'their standstills: RMS z of the differences of offsets {_rms(np.array(scores)):.2f}.'
     )
 
 
@@ -262,10 +262,10 @@ def main() -> None:
         'CPU, s',
     )
     seeds = [range(1000 * i, 1000 * i + each) for i in range(len(WORLDS))]
-    rows = [[*row(world, own)] for world, own in zip(WORLDS, seeds, strict=True)]
+    rows = [[*row(world, numbers)] for world, numbers in zip(WORLDS, seeds, strict=True)]
     rows.append([*row(OF_EACH_MARKER, range(9000, 9000 + max(1, each // 3)))])
     print(common.table(header, rows))
-    print(f'seeds {", ".join(f"{one.start} to {one.stop - 1}" for one in seeds)}')
+    print(f'seeds {", ".join(f"{span.start} to {span.stop - 1}" for span in seeds)}')
     print(verdicts(args.verdicts))
     if args.stops:
         print(stop_and_go(args.stops))

@@ -33,9 +33,9 @@ ROBOTS = ('iiwa7', 'six', 'ur10')
 FIRST_SEED = 700
 
 
-def compared(one: Session, other: Session) -> OffsetDifferences | None:
+def compared(first: Session, other: Session) -> OffsetDifferences | None:
     """Compare the offsets of two sessions."""
-    return offset_differences(*(sound_estimate(session) for session in (one, other)))
+    return offset_differences(*(sound_estimate(session) for session in (first, other)))
 
 
 def word(found: OffsetDifferences | None) -> str:

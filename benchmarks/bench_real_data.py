@@ -131,8 +131,8 @@ def fit_by_command(folder: Path) -> tuple[dict[str, Any], float]:
 
 
 def main() -> None:
-    beside = Path(__file__).resolve().parents[2] / 'shared' / 'data'
-    data = Path(sys.argv[1]) if len(sys.argv) > 1 else beside
+    default = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+    data = Path(sys.argv[1]) if len(sys.argv) > 1 else default
     errors, shares = [], []
     for name, limit in LIMITS_MM.items():
         if not (data / name).is_dir():
@@ -153,8 +153,8 @@ def main() -> None:
                 f'{seconds:.1f}',
             )
         )
-        held = coverage(data / name)
-        shares.append((name, *(_share(part) for part in held[:3]), *_looks(held)))
+        intervals = coverage(data / name)
+        shares.append((name, *(_share(part) for part in intervals[:3]), *_looks(intervals)))
     header = ('set', 'rows', 'held out', 'before, mm', 'after, mm', 'converged', 'command, s')
     print(table(header, errors))
     header = (
@@ -174,10 +174,10 @@ def _share(inside: FloatArray) -> str:
     return f'{100 * np.mean(inside):.1f} % of {len(inside)}' if len(inside) else '–'
 
 
-def _looks(held: Coverage) -> tuple[str, str, str]:
-    ratio = ', '.join('–' if np.isnan(value) else f'{value:.2f}' for value in held.ratio)
-    correlation = '–' if np.isnan(held.correlation) else f'{held.correlation:+.2f}'
-    return ratio, f'{held.excess:+.1f}', correlation
+def _looks(intervals: Coverage) -> tuple[str, str, str]:
+    ratio = ', '.join('–' if np.isnan(value) else f'{value:.2f}' for value in intervals.ratio)
+    correlation = '–' if np.isnan(intervals.correlation) else f'{intervals.correlation:+.2f}'
+    return ratio, f'{intervals.excess:+.1f}', correlation
 
 
 if __name__ == '__main__':

@@ -244,24 +244,29 @@ def main() -> None:
     )
     model, mode = PaperModel.of(session), product_mode(session)
     print(machine())
-    alone, with_set_up = ours(session, mode, model, 50_000 if args.full else 10_000)
+    product_speed, with_set_up = ours(session, mode, model, 50_000 if args.full else 10_000)
     run, _ = sample_posterior(mode, chains=4, draws=5000, rng=rng)
     posterior = product_states(model, mode, run.draws).reshape(-1, DIMENSION)
-    others = {
+    rivals = {
         'paper': paper(model, posterior, 24, 200_000 if args.full else 20_000),
         'emcee': by_emcee(model, 5000 if args.full else 2000),
         'nuts': by_nuts(model, 2000 if args.full else 400),
     }
     rows = [
-        (speed.name, f'{speed.rate:.3g}', _ratio(alone, speed, WANTED.get(key)), speed.note)
-        for key, speed in {'': alone, 'set-up': with_set_up, **others}.items()
+        (
+            speed.name,
+            f'{speed.rate:.3g}',
+            _ratio(product_speed, speed, WANTED.get(key)),
+            speed.note,
+        )
+        for key, speed in {'': product_speed, 'set-up': with_set_up, **rivals}.items()
     ]
     header = ('sampler', 'effective samples per CPU second', 'ours is faster', 'how')
     print(table(header, rows))
 
 
-def _ratio(alone: Speed, other: Speed, wanted: float | None) -> str:
-    ratio = alone.rate / other.rate
+def _ratio(product_speed: Speed, other: Speed, wanted: float | None) -> str:
+    ratio = product_speed.rate / other.rate
     if wanted is None:
         return f'{ratio:.3g}'
     if ratio >= wanted:

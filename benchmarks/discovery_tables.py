@@ -203,5 +203,5 @@ def _harm_as_measured(line: dict[str, Any]) -> bool:
     )
 
 
-def _percent(part: int, whole: int) -> str:
-    return f'{100.0 * part / whole:.1f} %'
+def _percent(part: int, total: int) -> str:
+    return f'{100.0 * part / total:.1f} %'

@@ -228,8 +228,8 @@ class Bench:
         """Start a node (again)."""
         command = [sys.executable, '-m', f'remaster_ros.nodes.{name}', '--ros-args']
         command += ['--params-file', str(config_path('fake.yaml'))]
-        own = {} if name in FAKES else {'cell': self._cell}
-        for key, value in {**own, **self._values[name]}.items():
+        values = {} if name in FAKES else {'cell': self._cell}
+        for key, value in {**values, **self._values[name]}.items():
             command += ['-p', f'{name}:{key}:={json.dumps(value)}']
         if name in self.relays:
             topic = RELAYED[name]

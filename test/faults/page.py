@@ -19,15 +19,15 @@ WRITES = MODE in ('write', 'add')
 
 def body(name: str) -> str:
     """Return a section as it stands on the page."""
-    _, rest = PAGE.read_text().split(BEGIN.format(name))
-    return rest.split(END, 1)[0].strip()
+    _, tail = PAGE.read_text().split(BEGIN.format(name))
+    return tail.split(END, 1)[0].strip()
 
 
 def replace(name: str, text: str) -> None:
     """Put another text into a section."""
     begin = BEGIN.format(name)
-    head, rest = PAGE.read_text().split(begin)
-    _, tail = rest.split(END, 1)
+    head, remainder = PAGE.read_text().split(begin)
+    _, tail = remainder.split(END, 1)
     PAGE.write_text(f'{head}{begin}\n\n{text}\n\n{END}{tail}')
 
 
@@ -83,10 +83,10 @@ def allows(page: list[tuple[str, ...]], seen: tuple[str, ...], said: int) -> boo
     said
         The column of reasons.
     """
-    rest = {tuple(_masked(c) for i, c in enumerate(row) if i != said) for row in page}
+    lines = {tuple(_masked(c) for i, c in enumerate(row) if i != said) for row in page}
     known = {part for row in page for part in _parts(row[said])}
     mine = tuple(_masked(c) for i, c in enumerate(seen) if i != said)
-    return mine in rest and _parts(seen[said]) <= known
+    return mine in lines and _parts(seen[said]) <= known
 
 
 def _parts(said: str) -> set[str]:

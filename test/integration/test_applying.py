@@ -141,9 +141,11 @@ COMBINATIONS = [
 def test_a_refit_after_applying_finds_nothing(before, form, tmp_path):
     session, out, _, known, std = before
     again = read_fit(fitted(FORMS[form](session, out / 'apply'), tmp_path) / 'fit.json')
-    left, _ = joint_offsets_of(again, chain_of(session))
+    offsets, _ = joint_offsets_of(again, chain_of(session))
     # The same measurements: what is left is the draws' error and the rounding of four digits.
-    assert np.all(np.abs(left[known]) < 0.3 * std[known] + np.radians(1e-4)), np.degrees(left)
+    assert np.all(np.abs(offsets[known]) < 0.3 * std[known] + np.radians(1e-4)), np.degrees(
+        offsets
+    )
 
 
 def test_joints_that_are_not_identifiable_are_named_in_each_file_and_corrected_in_none(before):

@@ -58,11 +58,11 @@ def test_the_hidden_arm_is_where_the_nominal_one_would_be(hidden, found):
     assert every.content.source.made_by == 'discover'
     tour = third_visits(RECIPE)
     good = judged(hidden, every.compensator, tour)
-    alone = judged(hidden, Compensator(arm_of_offsets(discovery.alone, 1.0).model), tour)
-    assert alone.rms_m > 0.4e-3
+    offsets_result = judged(hidden, Compensator(arm_of_offsets(discovery.alone, 1.0).model), tour)
+    assert offsets_result.rms_m > 0.4e-3
     # Of half as many poses as the 0.05 mm of the campaign takes.
     assert good.rms_m < 0.07e-3
-    assert good.rms_m < 0.1 * alone.rms_m
+    assert good.rms_m < 0.1 * offsets_result.rms_m
     # One session's errors have a common cause, so the share scatters; the campaign has the mean.
     assert good.inside > 0.7
     assert 0.4 < good.rms_m / good.predicted_m < 2.0
@@ -95,9 +95,11 @@ def test_file_and_memory_are_one(found):
     memory = Compensator(compensation_of(discovery, predictions_of(discovery).widening).model)
     file = remaster_ros.read_compensation(folder / 'apply' / 'compensation.json')
     q = discovery.residuals.context.measurements.q
-    tools = [one.tool(one.command(q)) for one in (memory, file.compensator)]
+    tools = [
+        compensator.tool(compensator.command(q)) for compensator in (memory, file.compensator)
+    ]
     assert np.abs(tools[0] - tools[1]).max() < 1e-9
-    covariances = [one.uncertainty(q) for one in (memory, file.compensator)]
+    covariances = [compensator.uncertainty(q) for compensator in (memory, file.compensator)]
     np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4, atol=1e-18)
     parameters = file.content.parameters
     assert len(parameters.names) == len(parameters.units) == len(parameters.mean)
@@ -126,10 +128,10 @@ def test_of_a_fit_the_file_has_its_offsets_and_nothing_else(fit, tmp_path):
     assert np.linalg.eigvalsh(file.uncertainty(q)).min() > 0.0
     # An offset that only a prior tells from a place of the marker is left out, its effect is not.
     assert np.any(fit.joint_offsets[~known] != 0.0)
-    alone, m = arm_of_offsets(fit, 1.0).model, fit.session.measurements
-    assert not np.any(alone.joint_offsets[~known])
+    model, m = arm_of_offsets(fit, 1.0).model, fit.session.measurements
+    assert not np.any(model.joint_offsets[~known])
     rows = ~m.is_validation
-    seen = alone.in_sensor(alone.state(m.q[rows]), 'mocap', 'sir')
+    seen = model.in_sensor(model.state(m.q[rows]), 'mocap', 'sir')
     expected = (m.position - fit.residuals_after)[rows]
     np.testing.assert_allclose(seen, expected, atol=1e-5)
 
@@ -138,24 +140,29 @@ def test_offsets_alone_err_by_what_the_arm_with_lengths_and_tilts_has_elsewhere(
     """Mean square: covariance there, and the square of what lies between the two predictions."""
     rows = fit.found.problem.measurements
     drawn = arm_of_geometry(fit, geometry_of(fit), rows)
-    alone = arm_of_offsets(fit, 1.0, geometry=drawn)
+    offsets_arm = arm_of_offsets(fit, 1.0, geometry=drawn)
     q, sensor, marker = rows.q[:30], 'mocap', 'sir'
-    seen = [one.in_sensor(one.state(q), sensor, marker) for one in (drawn.model, alone.model)]
-    apart = (seen[0] - seen[1]) @ alone.model.T_R_N[sensor][:3, :3].T
-    expected = Compensator(drawn.model).uncertainty(q) + apart[:, :, None] * apart[:, None, :]
-    found = Compensator(alone.model).uncertainty(q)
+    seen = [
+        model.in_sensor(model.state(q), sensor, marker)
+        for model in (drawn.model, offsets_arm.model)
+    ]
+    difference = (seen[0] - seen[1]) @ offsets_arm.model.T_R_N[sensor][:3, :3].T
+    expected = (
+        Compensator(drawn.model).uncertainty(q) + difference[:, :, None] * difference[:, None, :]
+    )
+    found = Compensator(offsets_arm.model).uncertainty(q)
     scale = np.trace(expected, axis1=1, axis2=2).mean()
     np.testing.assert_allclose(found, expected, atol=0.02 * scale)
     bare = Compensator(arm_of_offsets(fit, 1.0).model).uncertainty(q)
     assert np.trace(found, axis1=1, axis2=2).mean() > 1.2 * np.trace(bare, axis1=1, axis2=2).mean()
     path = tmp_path / 'compensation.json'
-    path.write_text(written(alone, fit.session, 'fit', ''), encoding='utf-8')
+    path.write_text(written(offsets_arm, fit.session, 'fit', ''), encoding='utf-8')
     file = remaster_ros.read_compensation(path)
     np.testing.assert_allclose(file.uncertainty(q), found, rtol=1e-4, atol=1e-18)
     # Of the offsets themselves the covariance stays what it is.
     std = np.linalg.norm(file.model.root, axis=0)[: file.model.joints]
     np.testing.assert_allclose(
-        std, np.linalg.norm(alone.model.root, axis=0)[: len(std)], rtol=1e-4
+        std, np.linalg.norm(offsets_arm.model.root, axis=0)[: len(std)], rtol=1e-4
     )
 
 

@@ -145,7 +145,7 @@ def spoil_bar(bar, numbers: dict[str, float]) -> str:
     now = client.status()
     reason = max(now.dropped, key=lambda r: now.dropped[r] - before[r])
     # How many frames are refused after a restart depends on how many there were before it.
-    many = now.dropped[reason] - before[reason] > 4 and 'renumbered' not in numbers
+    is_counted = now.dropped[reason] - before[reason] > 4 and 'renumbered' not in numbers
     world.numbers, count = {}, len(samples)
     assert optitrack_world.eventually(lambda: len(samples) > count + 5)
     assert optitrack_world.eventually(lambda: not client.diagnosis().message)
@@ -153,7 +153,7 @@ def spoil_bar(bar, numbers: dict[str, float]) -> str:
     radii = [np.hypot(*sample.position[:2]) for sample in samples]
     assert np.max(np.abs(np.array(radii) - 0.3)) < 5e-3
     parts = [said] if said and not harmless else []
-    parts += [f'counted and dropped as {reason.value.replace("_", " ")}'] if many else []
+    parts += [f'counted and dropped as {reason.value.replace("_", " ")}'] if is_counted else []
     return '; '.join([*parts, 'readings go on by themselves'])
 
 
@@ -296,8 +296,8 @@ class FaultyReflectorWorld(tracker_world.ReflectorWorld):
         return 'occluded' not in self.numbers
 
     def marker_in_sensor(self, sensor, t, marker=''):
-        beside = np.array([self.numbers.get('swapped', 0.0), 0.0, 0.0])
-        return super().marker_in_sensor(sensor, t, marker) + beside
+        shift = np.array([self.numbers.get('swapped', 0.0), 0.0, 0.0])
+        return super().marker_in_sensor(sensor, t, marker) + shift
 
 
 def measured(client: LaserTrackerClient) -> tuple[str, np.ndarray | None]:

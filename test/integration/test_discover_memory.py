@@ -80,7 +80,9 @@ def peak_mb(rows: int, folder: Path) -> float:
 @pytest.mark.qualify
 def test_memory_hardly_grows_with_the_rows(tmp_path):
     """100,000 rows fit into 2 GiB: a search of a gigabyte, and what each row adds."""
-    few, many = (peak_mb(rows, tmp_path / str(rows)) for rows in (FEW, MANY))
-    growth = 1e3 * (many - few) / (MANY - FEW)
-    print(f'{few:.0f} MB at {FEW} rows, {many:.0f} at {MANY}: {growth:.1f} MB per 1,000 rows')
+    few_mb, many_mb = (peak_mb(rows, tmp_path / str(rows)) for rows in (FEW, MANY))
+    growth = 1e3 * (many_mb - few_mb) / (MANY - FEW)
+    print(
+        f'{few_mb:.0f} MB at {FEW} rows, {many_mb:.0f} at {MANY}: {growth:.1f} MB per 1,000 rows'
+    )
     assert growth < MOST_MB_PER_THOUSAND_ROWS

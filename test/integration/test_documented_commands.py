@@ -67,11 +67,11 @@ def test_commands_of_every_kind_are_found_and_wrong_ones_refused() -> None:
 @pytest.mark.parametrize('page', ALL, ids=lambda page: page.stem)
 def test_commands_within_sentences_have_verbs_and_options_that_exist(page: Path) -> None:
     for words in re.findall(r'`remaster ([^`]+)`', FENCE.sub('', page.read_text('utf-8'))):
-        verb, *rest = words.split()
+        verb, *arguments = words.split()
         if verb in ('VERB', '…') or verb.startswith('-'):
             continue
         assert verb in VERBS, words
-        options = {word for word in rest if word.startswith('--')}
+        options = {word for word in arguments if word.startswith('--')}
         assert options <= {*parser(verb)._option_string_actions}, words
 
 

@@ -71,8 +71,10 @@ def worse_where_held_out(session: Session) -> Session:
     """Mirror what the offsets do on the held-out poses: there they have the wrong sign."""
     result = fit_session(session, rng=np.random.default_rng(0), draws=500)
     gain = result.residuals_before - result.residuals_after
-    held = session.measurements.is_validation[:, None]
-    return with_positions(session, session.measurements.position - np.where(held, 1.6 * gain, 0.0))
+    is_held_out = session.measurements.is_validation[:, None]
+    return with_positions(
+        session, session.measurements.position - np.where(is_held_out, 1.6 * gain, 0.0)
+    )
 
 
 FIT = {
@@ -189,9 +191,11 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
     assert np.array_equal(clean.measurements.q, read_session(tilted).measurements.q)
 
     def mirrored(session: Session) -> Session:
-        held = session.measurements.is_validation[:, None]
+        is_held_out = session.measurements.is_validation[:, None]
         opposite = 2.0 * clean.measurements.position - session.measurements.position
-        return with_positions(session, np.where(held, opposite, session.measurements.position))
+        return with_positions(
+            session, np.where(is_held_out, opposite, session.measurements.position)
+        )
 
     out = tmp_path / 'causes'
     process = remaster('discover', changed(tilted, tmp_path, mirrored), '--out', out)
@@ -199,10 +203,10 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
     assert 'nothing beyond' not in process.stdout
     found = json.loads((out / 'discovery.json').read_text(encoding='utf-8'))
     assert (found['verdict'], found['effects']) == ('unexplained', [])
-    (left,) = found['unexplained']
-    assert left['where'] == 'held_out_poses'
-    assert left['p_value'] < 0.05
-    assert 'joint axis tilt' in left['next'], left['next']
+    (error,) = found['unexplained']
+    assert error['where'] == 'held_out_poses'
+    assert error['p_value'] < 0.05
+    assert 'joint axis tilt' in error['next'], error['next']
     gain = found['gain']
     assert gain['held_out_rms_after_m'] <= 1.05 * gain['held_out_rms_before_m']
     # The zero-offsets are those of the fit without causes.
@@ -213,7 +217,7 @@ def test_causes_that_do_harm_on_held_out_poses_are_not_returned(tmp_path: Path) 
     page, mood, _ = page_of(out)
     assert mood == 'caution'
     assert 'Errors remain that no known cause explains' in page
-    assert left['next'] in page
+    assert error['next'] in page
 
 
 @pytest.mark.qualify

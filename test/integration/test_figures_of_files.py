@@ -98,12 +98,12 @@ def by_pinocchio(session, urdf, position, fitted):
 def taken_out(found, fit, candidates, chosen):
     """Return the measured positions less what some cells of a fit do."""
     problem, model, z = fit.found.problem, fit.predictive.model, fit.predictive.after.copy()
-    whole, start = predicted_rows(problem, model, z), model.core
+    prediction, start = predicted_rows(problem, model, z), model.core
     for candidate in candidates:
         if chosen(candidate):
             z[start : start + candidate.size] = 0.0
         start += candidate.size
-    return fit.session.measurements.position - whole + predicted_rows(problem, model, z)
+    return fit.session.measurements.position - prediction + predicted_rows(problem, model, z)
 
 
 def certain(found):
@@ -136,7 +136,7 @@ def test_figures_of_robot_models_are_those_of_their_files(result):
 
 def test_the_figure_of_the_compensation_is_that_of_the_file(result):
     _, session, found, folder, content = result
-    (row,) = (one for one in content['loadable'] if one['result'] == 'everything')
+    (row,) = (entry for entry in content['loadable'] if entry['result'] == 'everything')
     if not row['file']:
         return
     path = folder / row['file']
@@ -163,7 +163,7 @@ def test_the_figure_of_the_compensation_is_that_of_the_file(result):
 def test_the_compensation_predicts_its_session_as_the_discovery_does(result):
     """But for the terms that it has no place for: 0.1 mm off where backlash had bent it."""
     name, _, found, folder, content = result
-    (row,) = (one for one in content['loadable'] if one['result'] == 'everything')
+    (row,) = (entry for entry in content['loadable'] if entry['result'] == 'everything')
     if not row['file']:
         assert name in ('none', 'unexplained')
         return
@@ -175,9 +175,9 @@ def test_the_compensation_predicts_its_session_as_the_discovery_does(result):
         found, found.fit, found.solution.candidates,
         lambda candidate: candidate.of_measurement or not [*slots_of(candidate, CHAIN)],
     ) - found.fit.residuals_after  # fmt: skip
-    apart = np.linalg.norm(seen - expected, axis=1)
+    distance = np.linalg.norm(seen - expected, axis=1)
     # The fit has lengths and the like to first order.
-    assert np.sqrt(np.mean(apart**2)) < 1e-5
+    assert np.sqrt(np.mean(distance**2)) < 1e-5
     # Parameters stay where they were found.
     stated = {p['name']: p for effect in content['effects'] for p in effect['parameters']}
     for joint, term in ((t.joint, t) for t in file.model.joint_terms):

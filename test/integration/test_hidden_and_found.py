@@ -38,7 +38,7 @@ def found_in(recipe):
     for effect in found.effects:
         print('   ', effect.title, effect.probability)
     # What is likelier there than not is named, or it is said why not.
-    assert all(one.probability < 0.5 or one.why for one in found.search.less_likely)
+    assert all(cause.probability < 0.5 or cause.why for cause in found.search.less_likely)
     return hidden, found
 
 

@@ -109,7 +109,7 @@ def test_sizes_are_those_known_of_this_arm(iiwa: HiddenWorld) -> None:
         'registration_drift', (), np.array([0.0, 0.0, 1e-4 / 3600]), {'sensor': 'mocap'}
     )
     mocap = iiwa.sensor == 0
-    left = iiwa.left(iiwa.response(drift))[mocap]
+    errors = iiwa.left(iiwa.response(drift))[mocap]
     known = {
         'gear': (_of_all_joints(iiwa, 'gear_periodic', ARC_MINUTE, orders=(320,)), 0.16),
         'eccentricity': (
@@ -119,7 +119,7 @@ def test_sizes_are_those_known_of_this_arm(iiwa: HiddenWorld) -> None:
         'backlash': (_of_all_joints(iiwa, 'backlash', ARC_MINUTE), 0.12),
         'upper arm': (effect_size_mm(iiwa, 'link_length', 0.3e-3, 2), 0.28),
         'forearm': (effect_size_mm(iiwa, 'link_length', 0.3e-3, 4), 0.24),
-        'drift': (1e3 * np.sqrt(np.mean(np.sum(left**2, axis=1))) * 3.5 / hours, 0.10),
+        'drift': (1e3 * np.sqrt(np.mean(np.sum(errors**2, axis=1))) * 3.5 / hours, 0.10),
     }
     marker = HiddenEffect('marker_offset', (), np.array([0.3e-3, 0.0, 0.0]))
     known['marker'] = (1e3 * iiwa.size_m(marker), 0.29)

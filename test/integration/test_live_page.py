@@ -139,9 +139,9 @@ def test_from_begin_to_result(browser, played):
     )
     assert browser.text('#scene-note') == ''
     assert browser.errors == []
-    own = f'http://127.0.0.1:{played.server.port}/'
+    origin = f'http://127.0.0.1:{played.server.port}/'
     asked = {r['url'] for r in browser.requests if not r['url'].startswith(('data:', 'about:'))}
-    assert all(url.startswith(own) for url in asked), 'nothing is fetched from elsewhere'
+    assert all(url.startswith(origin) for url in asked), 'nothing is fetched from elsewhere'
 
 
 def test_std_stands_against_configurations_and_minutes(browser, played):
@@ -262,8 +262,8 @@ def test_the_page_of_a_plan_plays_and_reaches_nothing(browser, played):
     """It is shown as a stranger's page: whatever stands in it has neither token nor commands."""
     opened(browser, played)
     address = played.server.show_plan(registration_plan('ab12cd34').encode())
-    own = f'http://127.0.0.1:{played.server.port}'
-    browser.open(f'{own}/{address}')
+    origin = f'http://127.0.0.1:{played.server.port}'
+    browser.open(f'{origin}/{address}')
     browser.until(lambda: browser.value('!!document.querySelector("#scene canvas")'), 'the arm')
     browser.click('#after')
     browser.until(lambda: '2' in browser.text('#state'), 'the second configuration')
@@ -272,8 +272,8 @@ def test_the_page_of_a_plan_plays_and_reaches_nothing(browser, played):
     for reach in (
         'sessionStorage.getItem("token")',
         'document.cookie',
-        f'await fetch("{own}/view")',
-        f'await fetch("{own}/command/stop", {{method: "POST"}})',
+        f'await fetch("{origin}/view")',
+        f'await fetch("{origin}/command/stop", {{method: "POST"}})',
     ):
         tried = f'(async () => {{ try {{ return [{reach}] }} catch (e) {{ return "kept" }} }})()'
         assert browser.value(tried) == 'kept', reach
@@ -283,7 +283,7 @@ def test_the_page_of_a_plan_plays_and_reaches_nothing(browser, played):
 @pytest.mark.qualify
 def test_a_page_of_another_origin_gets_nowhere(browser, played):
     """Another server on this computer, whose page a person has open beside this one."""
-    own, other = f'http://127.0.0.1:{played.server.port}', HTTPServer(('127.0.0.1', 0), Empty)
+    url, other = f'http://127.0.0.1:{played.server.port}', HTTPServer(('127.0.0.1', 0), Empty)
     threading.Thread(target=other.serve_forever).start()
     try:
         browser.open(f'http://127.0.0.1:{other.server_port}/')
@@ -292,12 +292,12 @@ def test_a_page_of_another_origin_gets_nowhere(browser, played):
             ask = f'{{method: "{"GET" if path == "view" else "POST"}", mode: "MODE"}}'
             for mode, found in (('cors', 'refused'), ('no-cors', 'opaque 0')):
                 outcome = browser.value(
-                    f'fetch("{own}/{path}", {ask.replace("MODE", mode)})'
+                    f'fetch("{url}/{path}", {ask.replace("MODE", mode)})'
                     '.then((r) => `${r.type} ${r.status}`, () => "refused")'
                 )
                 # A token is guessed, too: the browser asks first, and is not answered.
                 guessed = browser.value(
-                    f'fetch("{own}/{path}", {{headers: {{Authorization: "Bearer {"T" * 43}"}}}})'
+                    f'fetch("{url}/{path}", {{headers: {{Authorization: "Bearer {"T" * 43}"}}}})'
                     '.then(() => "answered", () => "refused")'
                 )
                 # The header that forbids other pages to load this one makes `opaque` an error.

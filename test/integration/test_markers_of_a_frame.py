@@ -45,7 +45,7 @@ def test_markers_of_a_frame_make_the_offsets_more_certain_and_the_intervals_hold
     print('seed', SEED)
     rng = np.random.default_rng(SEED)
     inner = range(1, 6)
-    stds, held = {}, 0
+    stds, inside_count = {}, 0
     for names in (('a',), ('a', 'b', 'c', 'd')):
         spread = []
         for _ in range(15):
@@ -55,12 +55,12 @@ def test_markers_of_a_frame_make_the_offsets_more_certain_and_the_intervals_hold
             std = np.sqrt(np.diag(found.mode.covariance))[[free.index(j) for j in inner]]
             error = found.model.offsets(found.model.natural(found.mode.z)) - offsets
             error = error[1:6]
-            held += int(np.sum(np.abs(error) < 1.96 * std))
+            inside_count += int(np.sum(np.abs(error) < 1.96 * std))
             spread.append(std)
         stds[len(names)] = np.sqrt(np.mean(np.square(spread)))
     assert stds[4] < 0.6 * stds[1]
     # 95 % of 150; 132 or fewer come by chance in less than 1 of 1,000 cases.
-    assert held > 132
+    assert inside_count > 132
 
 
 def errors(session, offsets):
@@ -92,8 +92,8 @@ def test_noise_that_a_frame_shares_is_found_and_the_intervals_hold(configuration
     for _ in range(20):
         session, offsets = measured(CHAIN, CELL.urdf_text, chosen, sensors, rng)
         seen = rng.random(len(session.measurements)) >= hidden
-        one, parts = errors(session.select(seen), offsets)
-        z.append(one)
+        scaled, parts = errors(session.select(seen), offsets)
+        z.append(scaled)
         noise.append(parts)
     np.testing.assert_allclose(np.median(noise, axis=0), (0.1e-3, 0.2e-3, 0.2e-3), rtol=0.3)
     # 95 % of 100; 86 or fewer come by chance in less than 1 of 1,000 cases.
@@ -110,8 +110,8 @@ def test_without_the_frames_the_same_sessions_are_too_certain(configurations):
     z = []
     for _ in range(8):
         session, offsets = measured(CHAIN, CELL.urdf_text, configurations, sensors, rng)
-        alone = replace(session.measurements, frame=None)
-        z.append(errors(replace(session, measurements=alone), offsets)[0])
+        frameless_rows = replace(session.measurements, frame=None)
+        z.append(errors(replace(session, measurements=frameless_rows), offsets)[0])
     assert np.sqrt(np.mean(np.square(z))) > 1.4
 
 

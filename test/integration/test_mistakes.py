@@ -64,21 +64,21 @@ def simulated(robot: str, seed: int, markers: int = 1) -> Session:
 
 def five_joints(seed: int) -> Session:
     """The first five joints of an arm, as an arm."""
-    whole = simulated('ur5e', seed)
+    full_session = simulated('ur5e', seed)
     arm = measured('ur5e', 40, seed)
     chain = arm.chain
-    joints = parse_urdf(whole.urdf).parent_joint
+    joints = parse_urdf(full_session.urdf).parent_joint
     tip = next(link for link, joint in joints.items() if joint.name == chain.joint_names[4])
-    short = SerialChain.from_urdf(whole.urdf, whole.base_link, tip)
-    q = whole.measurements.q[:, :5]
+    short = SerialChain.from_urdf(full_session.urdf, full_session.base_link, tip)
+    q = full_session.measurements.q[:, :5]
     points = short.positions(q, MARKER, arm.offsets[:5])
     points = points + np.random.default_rng(seed).normal(0.0, 5e-5, points.shape)
     return replace(
-        whole,
+        full_session,
         tip_link=tip,
         markers={'m1': MARKER},
         measurements=replace(
-            whole.measurements, q=q, from_q=np.full_like(q, np.nan), position=points
+            full_session.measurements, q=q, from_q=np.full_like(q, np.nan), position=points
         ),
     )
 
@@ -109,8 +109,8 @@ def named(session: Session, option: str, plain_m: float) -> bool | None:
         return None if fit_error_m(session) < 2.0 * plain_m else False
     except MistakeFoundError as error:
         print(error, error.options)
-        told = f'{error} {error.options}'
-        return option in told.replace("'", '')
+        message = f'{error} {error.options}'
+        return option in message.replace("'", '')
     except InsufficientDataError as error:
         print(error)
         return False
@@ -174,8 +174,8 @@ def test_the_command_that_is_told_mends_the_session(name, kind, verb, tmp_path) 
     spoilt, _ = SPOILS[kind](session, np.random.default_rng(14))
     given = tmp_path / 'it is spoilt'
     write_outside_limits(given, spoilt)
-    told = refusal(verb, given, '--out', tmp_path / 'out', '--no-figures', '--quiet', status=1)
-    command = shlex.split(told.partition('; to mend it: ')[2])
+    message = refusal(verb, given, '--out', tmp_path / 'out', '--no-figures', '--quiet', status=1)
+    command = shlex.split(message.partition('; to mend it: ')[2])
     assert command[0] == 'remaster'
     remaster(*command[1:], '--quiet')
     again = read_session(command[command.index('--out') + 1])

@@ -110,7 +110,7 @@ def test_what_a_slide_does_is_named_with_its_size_in_metres(arm, kind, seed):
     assert all(abs(deviation) < 3.3 for deviation in judged.deviations.values())
     (effect,) = found.effects
     if kind in UNITS:
-        assert {one.unit for one in effect.parameters} == {UNITS[kind]}
+        assert {parameter.unit for parameter in effect.parameters} == {UNITS[kind]}
     if kind not in ('joint_axis_tilt', 'pitching_guide'):
         assert not any('′' in size or '°' in size for size in effect.sizes)
         assert all(' mm' in size for size in effect.sizes)
@@ -148,8 +148,8 @@ def test_a_correction_has_it_in_metres_and_takes_it_off(tmp_path, kind):
     wanted = hidden.arm.state(q).tool_origin
     before = true - wanted
     model = correction.model.state(q).tool[:, :3, 3]
-    left = true - model
-    spread = [np.std(errors - errors.mean(axis=0)) for errors in (before, left)]
+    remaining_error = true - model
+    spread = [np.std(errors - errors.mean(axis=0)) for errors in (before, remaining_error)]
     assert spread[1] < 0.35 * spread[0]
 
 
@@ -212,8 +212,8 @@ def test_the_page_of_it_has_no_angle_of_a_slide(tmp_path):
 
 def test_what_is_held_at_single_places_is_drawn_at_each_of_them(tmp_path):
     """A line or a band between places where nothing was measured is not drawn."""
-    held = [-0.4, 0.0, 0.4]
-    path = sliding_cell(tmp_path, rail(), held_joint='rail', held_values_m=held)
+    places = [-0.4, 0.0, 0.4]
+    path = sliding_cell(tmp_path, rail(), held_joint='rail', held_values_m=places)
     cell = read_cell(path)
     run = simulate_workcell(
         cell,
@@ -225,7 +225,9 @@ def test_what_is_held_at_single_places_is_drawn_at_each_of_them(tmp_path):
     )
     found = discover_session(run.session, rng=np.random.default_rng(3))
     assert [effect.name for effect in found.effects] == ['encoder_scale']
-    (ax,) = (one for one in causes(found).axes if 'encoder scale' in one.get_title())
+    (ax,) = (axes for axes in causes(found).axes if 'encoder scale' in axes.get_title())
     drawn = sorted(tuple(bar.lines[0].get_xydata()[0]) for bar in ax.containers)
     (scale,) = found.effects[0].parameters
-    np.testing.assert_allclose(drawn, [(1e3 * x, 1e3 * x * scale.value) for x in held], atol=0.02)
+    np.testing.assert_allclose(
+        drawn, [(1e3 * x, 1e3 * x * scale.value) for x in places], atol=0.02
+    )

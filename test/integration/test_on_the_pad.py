@@ -41,27 +41,27 @@ JOINTS = [f'joint_{i}' for i in range(1, 7)]
 def axes_of(options: set[str]) -> tuple[list[Axis], str, list[str]]:
     """Return the axes in the order of the table, the unit, and what the import is told."""
     axes = [Axis(name, joint) for name, joint in zip(NAMES, JOINTS, strict=True)]
-    unit, told = 'deg', []
+    unit, arguments = 'deg', []
     if 'couple' in options:
         axes[2].added = ('A2', 1)
-        told += ['--couple', 'A3=A2']
+        arguments += ['--couple', 'A3=A2']
     if 'reverse' in options:
         # With a coupling both of its joints count the other way round.
         for axis in axes[1:3]:
             axis.sign = -1
-        told += ['--reverse', 'A2,A3']
+        arguments += ['--reverse', 'A2,A3']
     if 'offset' in options:
         axes[1].zero = 90.0
         axes[4].zero = -90.0
-        told += ['--offset', 'A2=90', '--offset', 'A5=-90']
+        arguments += ['--offset', 'A2=90', '--offset', 'A5=-90']
     if 'radians' in options:
         unit = 'rad'
-        told += ['--angles', 'rad']
+        arguments += ['--angles', 'rad']
     if 'order' in options:
         axes[3], axes[4] = axes[4], axes[3]
         # The joint keeps the name of its column.
-        told += ['--joints', ','.join(axis.name for axis in sorted(axes, key=_base_to_tip))]
-    return axes, unit, told
+        arguments += ['--joints', ','.join(axis.name for axis in sorted(axes, key=_base_to_tip))]
+    return axes, unit, arguments
 
 
 def _base_to_tip(axis: Axis) -> str:
@@ -108,12 +108,12 @@ class Cell:
         remaster('fit', session, '--out', out, *QUICK)
         rows = json.loads((out / 'fit.json').read_text())['joint_offsets']
         assert [row['joint'] for row in rows] == JOINTS
-        told = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')
+        instructions = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')
         return (
             np.array([row['mean_deg'] for row in rows]),
             np.array([row.get('std_if_exactly_drawn_deg', row['std_deg']) for row in rows]),
             np.array([row['identifiable'] for row in rows]),
-            told,
+            instructions,
         )
 
 
@@ -144,15 +144,15 @@ INNER = [False, True, True, True, True, False]
 )
 def test_re_mastered_as_told_and_measured_again_no_offset_is_left(option, tmp_path):
     cell = Cell(tmp_path, {option}, 'motors', seed=OPTIONS.index(option))
-    found, std, known, told = cell.fitted('before')
-    print(told)
+    found, std, known, instructions = cell.fitted('before')
+    print(instructions)
     assert known.tolist() == INNER
     true = np.array(list(cell.wrong.values()))
     assert np.all(np.abs(found - true)[known] < SIGMAS * std[known] + DIGITS_DEG)
-    master_as_told(told, cell.pad)
-    left, std_again, _, _ = cell.fitted('after')
+    master_as_told(instructions, cell.pad)
+    remaining, std_again, _, _ = cell.fitted('after')
     limit = SIGMAS * np.hypot(std, std_again) + DIGITS_DEG
-    assert np.all(np.abs(left) < limit, where=known), (left, limit)
+    assert np.all(np.abs(remaining) < limit, where=known), (remaining, limit)
     # And far from the offsets that there were.
     assert np.all(limit < 0.1 * np.abs(true), where=known)
 
@@ -166,19 +166,22 @@ def test_pairs_of_options_leave_the_controller_without_offsets(options, tmp_path
     """Of the controller itself, whatever it keeps, and also where it sets nothing but 0."""
     kinds: list[Keeps] = ['motors', 'shown']
     cell = Cell(tmp_path, options, kinds[0], seed=10 + PAIRS.index(options))
-    _, std, known, told = cell.fitted('before')
+    _, std, known, instructions = cell.fitted('before')
     assert known.tolist() == INNER
     for keeps in kinds:
         for only_zero in (False, True):
             pad = Pad(cell.axes, cell.wrong, cell.pad.unit, keeps)
             before = np.array([pad.missing()[joint] for joint in JOINTS])
             np.testing.assert_allclose(before, list(cell.wrong.values()), atol=1e-9)
-            master_as_told(told, pad, only_zero)
-            left = np.array([pad.missing()[joint] for joint in JOINTS])
-            assert np.all(np.abs(left[known]) < SIGMAS * std[known] + DIGITS_DEG), (keeps, left)
+            master_as_told(instructions, pad, only_zero)
+            remaining = np.array([pad.missing()[joint] for joint in JOINTS])
+            assert np.all(np.abs(remaining[known]) < SIGMAS * std[known] + DIGITS_DEG), (
+                keeps,
+                remaining,
+            )
             assert SIGMAS * std[known].max() < 0.1 * np.abs(before[known]).min()
             # What the data do not determine stays as it was.
-            np.testing.assert_allclose(left[~known], before[~known], atol=1e-9)
+            np.testing.assert_allclose(remaining[~known], before[~known], atol=1e-9)
 
 
 def test_a_joint_of_unknown_zero_keeps_it_where_another_is_added_to_it(tmp_path):
@@ -187,21 +190,21 @@ def test_a_joint_of_unknown_zero_keeps_it_where_another_is_added_to_it(tmp_path)
     cell.axes[5].added = ('A5', 1)
     cell.told = ['--couple', 'A6=A5']
     cell.pad = Pad(cell.axes, cell.wrong, 'deg', 'shown')
-    _, std, known, told = cell.fitted('before')
-    print(told)
+    _, std, known, instructions = cell.fitted('before')
+    print(instructions)
     assert known.tolist() == INNER
     for keeps in ('motors', 'shown'):
         pad = Pad(cell.axes, cell.wrong, 'deg', keeps)
-        master_as_told(told, pad)
-        left = np.array([pad.missing()[joint] for joint in JOINTS])
-        assert np.all(np.abs(left[known]) < SIGMAS * std[known] + DIGITS_DEG)
-        np.testing.assert_allclose(left[5], cell.wrong['joint_6'], atol=2e-4)
+        master_as_told(instructions, pad)
+        remaining = np.array([pad.missing()[joint] for joint in JOINTS])
+        assert np.all(np.abs(remaining[known]) < SIGMAS * std[known] + DIGITS_DEG)
+        np.testing.assert_allclose(remaining[5], cell.wrong['joint_6'], atol=2e-4)
     page = page_of(tmp_path / 'before', tmp_path / 'before_fit')
     assert 'Leave A1 (joint_1) as it is' in page
 
 
 @pytest.mark.parametrize(
-    ('table', 'urdf', 'told', 'drive_to', 'set_to'),
+    ('table', 'urdf', 'arguments', 'drive_to', 'set_to'),
     [
         ('1_reversed_pad', 'irb120', ['--reverse', 'A3'], {'A3': -0.2876}, {'A3': 0.0}),
         ('1_zero_90_off_pad', 'irb120', ['--offset', 'A2=90'], {'A2': -89.4682}, {'A2': -90.0}),
@@ -215,11 +218,11 @@ def test_a_joint_of_unknown_zero_keeps_it_where_another_is_added_to_it(tmp_path)
         ),
     ],
 )
-def test_tables_of_pads_that_count_otherwise(table, urdf, told, drive_to, set_to, tmp_path):
+def test_tables_of_pads_that_count_otherwise(table, urdf, arguments, drive_to, set_to, tmp_path):
     if not CASES.is_dir():
         pytest.skip('the tables of other pads are not part of this repository')
     session, out = tmp_path / 'session', tmp_path / 'fit'
-    given = (CASES / f'{table}.csv', '--urdf', CASES / f'{urdf}.urdf', *told)
+    given = (CASES / f'{table}.csv', '--urdf', CASES / f'{urdf}.urdf', *arguments)
     remaster('import', *given, '--out', session, '--quiet')
     remaster('fit', session, '--out', out, *QUICK)
     text_file = (out / 'apply' / 'remaster.txt').read_text(encoding='utf-8')

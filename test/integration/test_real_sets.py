@@ -76,8 +76,8 @@ def test_errors_that_no_cause_stands_out_of_are_never_nothing() -> None:
     found = discover_session(session.select(np.isin(pose, half)), rng=np.random.default_rng(1))
     assert found.effects == ()
     assert found.verdict == 'unexplained'
-    (left,) = found.unexplained
-    assert left.size_m < 0.05e-3
+    (error,) = found.unexplained
+    assert error.size_m < 0.05e-3
     # The model that has it does no harm.
     assert found.gain.held_out_rms_after_m < found.gain.held_out_rms_before_m
 
@@ -89,15 +89,17 @@ def test_what_can_be_loaded_of_a_panda(tmp_path: Path) -> None:
     file = read_compensation(tmp_path / 'apply/compensation.json')
     memory = Compensator(compensation_of(found, predictions_of(found).widening).model)
     q = found.residuals.context.measurements.q
-    tools = [one.tool(one.command(q)) for one in (memory, file.compensator)]
+    tools = [
+        compensator.tool(compensator.command(q)) for compensator in (memory, file.compensator)
+    ]
     assert np.abs(tools[0] - tools[1]).max() < 1e-9
-    covariances = [one.uncertainty(q) for one in (memory, file.compensator)]
+    covariances = [compensator.uncertainty(q) for compensator in (memory, file.compensator)]
     np.testing.assert_allclose(covariances[0], covariances[1], rtol=1e-4, atol=1e-18)
     # A URDF holds lengths and tilts: those beside its soft base would leave 1.16 mm.
-    left = form_content(file, 'urdf', np.random.default_rng(0))
+    content = form_content(file, 'urdf', np.random.default_rng(0))
     # Bearings that tip, which no such form holds, are most of it.
-    assert left.rms_mm < 1.0
-    assert 'export that one' in left.better_file
+    assert content.rms_mm < 1.0
+    assert 'export that one' in content.better_file
     loadable = json.loads((tmp_path / 'discovery.json').read_text())['loadable']
     offsets, geometry, everything = (row['held_out_mean_mm'] for row in loadable)
     assert offsets > 1.0
@@ -142,9 +144,11 @@ def test_everything_can_be_loaded_where_the_reflector_is_near_an_axis(
     q = found.residuals.context.measurements.q
     assert np.abs(file.compensator.command(q) - q).max() < np.deg2rad(2.0)
     # In one of them the model of all kinds leaves nothing to what the search has named.
-    told = [effect for effect in found.effects if 'another kind has all of it' in effect.cause]
-    assert bool(told) == (name == 'ur10_two_solutions')
+    covered_effects = [
+        effect for effect in found.effects if 'another kind has all of it' in effect.cause
+    ]
+    assert bool(covered_effects) == (name == 'ur10_two_solutions')
     assert all(effect.size_m >= 0.5e-6 for effect in found.effects)
-    assert all(effect.remedy.startswith('Measure more poses first') for effect in told)
+    assert all(effect.remedy.startswith('Measure more poses first') for effect in covered_effects)
     # It may be all of what the search found, or nothing.
-    assert not any(effect.is_certain for effect in told)
+    assert not any(effect.is_certain for effect in covered_effects)

@@ -83,9 +83,11 @@ def test_twice_is_the_same_and_the_session_beside_the_bag_is_compared(arm, tmp_p
 
     # Averaged over fewer frames; a row that is not in the bag; one that the session lacks.
     path = tmp_path / 'session' / 'observations.csv'
-    header, one, two, _, four = path.read_text().splitlines()
-    assert ',25,' in two, two
-    path.write_text('\n'.join([header, one, two.replace(',25,', ',5,'), four, '']))
+    header, first_row, second_row, _, fourth_row = path.read_text().splitlines()
+    assert ',25,' in second_row, second_row
+    path.write_text(
+        '\n'.join([header, first_row, second_row.replace(',25,', ',5,'), fourth_row, ''])
+    )
     done = replay(arm, tmp_path, out='third', status=1)
     (line,) = done.stderr.splitlines()
     assert 'error: 2 rows' in line
@@ -114,12 +116,12 @@ def test_what_no_message_holds_is_decided_as_the_recorder_did(arm, tmp_path, las
     arm.close()
     replay(arm, tmp_path)
     kinds = [(row['pose'], row['sensor']) for row in rows(tmp_path / 'again')]
-    rest = [('3', 'tracker'), ('3', 'mocap'), *4 * [('4', '')]]
+    expected = [('3', 'tracker'), ('3', 'mocap'), *4 * [('4', '')]]
     assert kinds[0] == ('3', 'mocap')
     if last:
         assert len(kinds) == 1
         return
-    assert kinds[1:3] == rest[:2]
+    assert kinds[1:3] == expected[:2]
     assert len(kinds) == 7
     journal = read_journal(tmp_path / 'again' / 'journal.jsonl').records
     ended = [record for record in journal if record['kind'] == 'configuration']

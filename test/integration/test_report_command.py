@@ -116,12 +116,12 @@ def test_a_bump_is_told_in_words_by_the_clock(made: Path, page: Text) -> None:
     text = ' '.join(page.words)
     sensor = truth['sensor']
     assert f'The sensor {sensor} moved' in text
-    told = re.search(
+    sentence = re.search(
         r'jumped at 08:(\d\d):(\d\d) UTC on 2026-11-22, .* between configurations (\d+) and (\d+)',
         text,
     )
-    assert told is not None
-    clock_s = 60 * (int(told[1]) - 43) + int(told[2]) - 20
+    assert sentence is not None
+    clock_s = 60 * (int(sentence[1]) - 43) + int(sentence[2]) - 20
     rows = list(csv.DictReader((made / 'session/observations.csv').read_text().splitlines()))
     elapsed = np.array([float(row['stamp_s']) for row in rows])
     found_s = clock_s - (elapsed[0] - START_S)
@@ -129,8 +129,8 @@ def test_a_bump_is_told_in_words_by_the_clock(made: Path, page: Text) -> None:
     # Readings beside the jump are none of the gross errors: they tell when it was.
     before = elapsed < truth['moment_s']
     configuration = np.array([int(row['configuration']) for row in rows])
-    assert int(told[3]) == configuration[before].max()
-    assert int(told[4]) == configuration[~before].min()
+    assert int(sentence[3]) == configuration[before].max()
+    assert int(sentence[4]) == configuration[~before].min()
     assert elapsed[before].max() <= found_s <= elapsed[~before].min()
     assert 'left out as gross errors' not in text
     assert re.search(rf'{sensor} by \d\.\d+ mm ± 0\.\d+ mm along \([^)]*\) in its own frame', text)
@@ -172,11 +172,11 @@ def test_the_pdf_is_a_few_pages(made: Path) -> None:
     data = (made / 'report/report.pdf').read_bytes()
     assert data.startswith(b'%PDF')
     # Most objects stand in compressed streams.
-    whole = b''.join(
+    unpacked_data = b''.join(
         zlib.decompressobj().decompress(stream.lstrip(b'\r\n'))
         for stream in re.findall(rb'/FlateDecode.*?stream(.*?)endstream', data, re.DOTALL)
     )
-    assert 2 <= len(re.findall(rb'/Type /Page\b', data + whole)) <= 7
+    assert 2 <= len(re.findall(rb'/Type /Page\b', data + unpacked_data)) <= 7
 
 
 def test_results_of_other_data_are_refused_in_one_line(made: Path, tmp_path: Path) -> None:

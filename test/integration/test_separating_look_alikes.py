@@ -31,9 +31,9 @@ def test_a_sag_that_looks_like_a_base_that_yields_is_decided():
     session, world, truth = measured_further(pair, visits_of(pair, design))
     after = discover_session(session, rng=np.random.default_rng(number))
     assert verdict(after, pair, world, truth) == 'right'
-    (one,) = decisions(after, [(Named(*pair.true), Named(*pair.other))])
-    assert one.answer == 'cause'
-    assert one.sigma > 1.6
+    (decision,) = decisions(after, [(Named(*pair.true), Named(*pair.other))])
+    assert decision.answer == 'cause'
+    assert decision.sigma > 1.6
     # What was measured first is as it was, and the rest is behind it.
     rows = session.measurements
     n = len(pair.session.measurements)

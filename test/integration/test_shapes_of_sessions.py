@@ -68,7 +68,7 @@ def goes_through_every_verb(session, folder, figures=False):
         said = remaster(*verb, *more, status=0 if recorded else 2)
         assert ('error' in said.stderr) == (not recorded)
     offsets = json.loads((fit / 'fit.json').read_text())['joint_offsets']
-    assert sum(one['identifiable'] for one in offsets) >= len(offsets) - 3
+    assert sum(offset['identifiable'] for offset in offsets) >= len(offsets) - 3
     again = read_session(folder / 'again').measurements
     assert len(again) == len(table.read_text().splitlines()) - 1
 

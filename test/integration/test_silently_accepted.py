@@ -230,9 +230,9 @@ def test_seven_joints_of_which_the_wrong_one_is_held(tmp_path: Path) -> None:
     assert len(json.loads((out / 'truth.json').read_text())['joint_offsets']) == 7
 
 
-@pytest.mark.parametrize('held', ['', 'panda_joint3'])
+@pytest.mark.parametrize('held_joint', ['', 'panda_joint3'])
 def test_a_joint_whose_holding_leaves_no_closed_form_may_be_held(
-    held: str, tmp_path: Path
+    held_joint: str, tmp_path: Path
 ) -> None:
     """Nobody named: the third one."""
     description = robot_descriptions.panda()
@@ -242,7 +242,7 @@ def test_a_joint_whose_holding_leaves_no_closed_form_may_be_held(
         ('../robots/lwr4plus.urdf', str(tmp_path / 'arm.urdf')),
         ('base_link: base_link', f'base_link: {description.base_link}'),
         ('tip_link: tool', f'tip_link: {description.tip_link}'),
-        ('held_joint: joint_3', f'held_joint: {held}'),
+        ('held_joint: joint_3', f'held_joint: {held_joint}'),
         ('held_values_deg: [0.0]', 'held_values_deg: [30.0]'),
     )
     out = tmp_path / 'session'
@@ -253,8 +253,10 @@ def test_a_joint_whose_holding_leaves_no_closed_form_may_be_held(
 def test_a_small_session_is_still_read(session: Path, tmp_path: Path) -> None:
     """Neither zeros that a power cut leaves nor a quoted header are taken for something else."""
     measurements = read_session(session).measurements
-    whole = read_session(session)
-    write_session(tmp_path / 's', replace(whole, measurements=measurements.select(np.arange(4))))
+    full_session = read_session(session)
+    write_session(
+        tmp_path / 's', replace(full_session, measurements=measurements.select(np.arange(4)))
+    )
     rows = tmp_path / 's' / 'observations.csv'
     rows.write_bytes(rows.read_bytes() + b'\0' * 200)
     assert len(read_session(tmp_path / 's').measurements) == 4

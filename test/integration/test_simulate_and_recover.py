@@ -219,9 +219,9 @@ def test_accuracy_of_given_offsets() -> None:
         assert metric['after']['mean_mm'] < 0.5 < metric['before']['mean_mm']
         assert found[split]['theoretical']['after'] is None
     held_out = session.select(np.flatnonzero(session.measurements.is_validation))
-    alone = judge(held_out, truth.joint_offsets).accuracy
-    assert alone['optimization']['relative']['after']['mean_mm'] < 0.5
-    assert alone['validation'] is None
+    accuracy = judge(held_out, truth.joint_offsets).accuracy
+    assert accuracy['optimization']['relative']['after']['mean_mm'] < 0.5
+    assert accuracy['validation'] is None
     with pytest.raises(InputError, match='6 zero-offsets for a robot of 7'):
         judge(session, truth.joint_offsets[:6])
     with pytest.raises(InputError, match='6 zero-offsets for a robot of 7'):

@@ -131,6 +131,6 @@ def test_backlash_is_no_slip(tmp_path: Path) -> None:
     assert 'slipped' not in text
     # No file corrects it: what is left of the error with what can be loaded is the backlash's.
     offsets, *_, every = (row['held_out_mean_mm'] for row in found['loadable'])
-    whole = found['metrics']['post_registration']['after']['mean_mm']
-    assert whole < 0.7 * offsets
+    total = found['metrics']['post_registration']['after']['mean_mm']
+    assert total < 0.7 * offsets
     assert every > 0.9 * offsets

@@ -34,21 +34,21 @@ def bench(ros_environment, tmp_path):
     made = []
 
     def make(name, **options):
-        one = bench_of(
+        rig = bench_of(
             int(ros_environment['ROS_DOMAIN_ID']), tmp_path / name, np.random.default_rng(1),
             RULES, emergency_stop_topic=EMERGENCY, heartbeat_s=5.0, **options,
         )  # fmt: skip
-        made.append(one)
-        one.emergency_shown = False
-        one.start()
-        assert one.until(lambda: one.seen.summaries, 60.0)
-        one.up_for(4.0)
-        return one
+        made.append(rig)
+        rig.emergency_shown = False
+        rig.start()
+        assert rig.until(lambda: rig.seen.summaries, 60.0)
+        rig.up_for(4.0)
+        return rig
 
     make.made = made
     yield make
-    for one in made:
-        one.close()
+    for rig in made:
+        rig.close()
 
 
 def begun(b, goal):

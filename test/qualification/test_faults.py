@@ -104,14 +104,14 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
         listener.stands()
         assert call(client, '/remaster/collect').success
 
-    held = [
+    cases = [
         ({'robot': {'nan': 1}}, 'robot_bridge', 'joint_states are not finite'),
         ({'robot': {'renamed': 1}}, 'robot_bridge', "none of the cell's joints"),
         ({'robot': {'off': 1}}, 'robot_bridge', 'no sign of robot'),
         ({'mocap': {'stopped': 1}}, 'recorder', 'waiting for mocap: no frame for'),
         ({'tracker': {'off': 1}}, 'recorder', 'waiting for tracker'),
     ]
-    for faults, node, reason in held:
+    for faults, node, reason in cases:
         listener.moves()
         inject(world, faults)
         listener.says(node, reason)

@@ -44,14 +44,14 @@ def one_of_each(outcomes: list[Outcome], per_session: list[list[float]]) -> np.n
 def test_intervals_hold_as_often_as_they_say(outcomes: list[Outcome]) -> None:
     """Four parameters of each session, as if independent: their bonds only widen the bounds."""
     rng = np.random.default_rng(2)
-    held = [
+    hits = [
         bool(value)
         for outcome in outcomes
         for value in rng.choice(list(outcome.inside.values()), 4, replace=False)
     ]
     # 1e-4 in place of 1e-3 for what the four of a session share.
-    low, high = binom.ppf((0.5e-4, 1.0 - 0.5e-4), len(held), 0.95)
-    assert low <= sum(held) <= high, sum(held) / len(held)
+    low, high = binom.ppf((0.5e-4, 1.0 - 0.5e-4), len(hits), 0.95)
+    assert low <= sum(hits) <= high, sum(hits) / len(hits)
 
 
 def test_ranks_of_the_truth_are_uniform(outcomes: list[Outcome]) -> None:

@@ -145,8 +145,8 @@ def planner(ros_environment, tmp_path):
         return running[-1]
 
     yield begin
-    for one in running:
-        one.end()
+    for process in running:
+        process.end()
 
 
 def clients(around):
@@ -170,29 +170,29 @@ def test_it_leaves_before_the_work_is_done(around, planner, name, busy):
     """The state is out and the service has answered while the work still goes on."""
     # Planning of so many poses takes seconds; so does the slow disk.
     size = 300 if busy == 'planning' else 6
-    one = planner(3.0 if busy == 'writing' else 0.0, registration_candidates=size)
+    node = planner(3.0 if busy == 'writing' else 0.0, registration_candidates=size)
     around.until(lambda: around.said, 'the planner')
     ask = clients(around)
     around.until(lambda: 'robot is' not in around.said[-1][2], 'the robot')
     ask('collect')
-    around.until(lambda: one.when(busy) is not None, busy)
+    around.until(lambda: node.when(busy) is not None, busy)
     time.sleep(0.3)
     asked = time.monotonic()
     future = ask(name)
     state = {'pause': 'paused', 'stop': 'stopped'}[name]
     around.until(lambda: around.said[-1][1] == state, state)
-    left = around.said[-1][0]
+    said_s = around.said[-1][0]
     done = {'planning': 'planned', 'writing': 'written'}[busy]
-    assert one.when(done) is None or one.when(done) > asked, 'too little work for this test'
-    assert one.when(done) is None or one.when(done) > left, 'it waited for the work'
+    assert node.when(done) is None or node.when(done) > asked, 'too little work for this test'
+    assert node.when(done) is None or node.when(done) > said_s, 'it waited for the work'
     around.until(future.done, 'the answer')
     answered = time.monotonic()
     assert future.result().success, future.result().message
-    print(f'{name} while {busy}: said after {1e3 * (left - asked):.0f} ms')
-    around.until(lambda: one.when(done) is not None and one.when(done) > asked, done)
-    assert answered < one.when(done)
+    print(f'{name} while {busy}: said after {1e3 * (said_s - asked):.0f} ms')
+    around.until(lambda: node.when(done) is not None and node.when(done) > asked, done)
+    assert answered < node.when(done)
     later = time.monotonic() + 1.5
     around.until(lambda: time.monotonic() > later, 'time')
     # The empty one of a stop is no pose.
     assert not [message for message in around.solutions if message.points]
-    assert {state for at, state, _ in around.said if at > left} == {state}
+    assert {state for at, state, _ in around.said if at > said_s} == {state}

@@ -41,8 +41,8 @@ def browser(tmp_path):
 def watched(start, port, fit, cell):
     """Start the page; return its process and the address with the token."""
     common = ROOT / 'config' / 'fake.yaml'
-    own = {'watch:port': port, 'watch:fit': fit, 'watch:cell': cell}
-    process = start('remaster_ros.nodes.watch', *node_arguments(common, **own))
+    values = {'watch:port': port, 'watch:fit': fit, 'watch:cell': cell}
+    process = start('remaster_ros.nodes.watch', *node_arguments(common, **values))
     line = process.stdout.readline()
     file = Path(re.fullmatch(r'live page: open (.*)\n', line)[1])
     assert file.stat().st_mode & 0o077 == 0
@@ -126,10 +126,12 @@ def test_plan_confirm_collect_pause_reload_kill_stop_result(start, client, brows
         collect=False,
         rate=4.0,
     )
-    own = {'session': cell.session, 'out': fit, 'figures': False}
-    own = {f'optimizer:{key}': value for key, value in own.items()}
+    values = {'session': cell.session, 'out': fit, 'figures': False}
+    values = {f'optimizer:{key}': value for key, value in values.items()}
     fake = ROOT / 'config' / 'fake.yaml'
-    cell.nodes['optimizer'] = start('remaster_ros.nodes.optimizer', *node_arguments(fake, **own))
+    cell.nodes['optimizer'] = start(
+        'remaster_ros.nodes.optimizer', *node_arguments(fake, **values)
+    )
     person = Person(cell, client, browser)
     until, keep_going, state = person.until, person.keep_going, person.state
 

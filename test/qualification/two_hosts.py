@@ -115,7 +115,7 @@ def nodes(
     hosts: Hosts, out: Path, world: Path, args: argparse.Namespace
 ) -> Iterator[dict[str, subprocess.Popen[bytes]]]:
     """Run every node on its host; end them all."""
-    own: dict[str, dict[str, Any]] = {
+    parameters: dict[str, dict[str, Any]] = {
         **{name: {'world': str(world)} for name in (*SENSORS[:2], 'fake_robot')},
         'pose_planner': {
             'seed': args.seed,
@@ -135,7 +135,7 @@ def nodes(
                 if name in SENSORS:
                     # The World waits for a node that is busy; one that is cut off is not busy.
                     command += ['-r', f'{TAKEN}:=nobody_hears']
-                for key, value in own.get(name, {}).items():
+                for key, value in parameters.get(name, {}).items():
                     command += ['-p', f'{name}:{key}:={json.dumps(value)}']
                 with (out / f'{name}.log').open('wb') as log:
                     running[name] = subprocess.Popen(
@@ -221,7 +221,7 @@ class Watch:
 
     def until(self, done: Any, what: str) -> None:
         """Wait until something holds."""
-        deadline, told = time.monotonic() + PATIENCE_S, 0.0
+        deadline, printed_s = time.monotonic() + PATIENCE_S, 0.0
         while not done():
             self.look()
             ended = [name for name, process in self._running.items() if process.poll() is not None]
@@ -231,8 +231,8 @@ class Watch:
                 raise SystemExit(f'halted while we waited for {what}: {halted}')
             if time.monotonic() > deadline:
                 raise SystemExit(f'waited {PATIENCE_S:g} s in vain for {what}: {self.said}')
-            if time.monotonic() - told > 10.0:
-                told = time.monotonic()
+            if time.monotonic() - printed_s > 10.0:
+                printed_s = time.monotonic()
                 print(f'  waiting for {what}: {self.progress()}', flush=True)
             time.sleep(0.1)
 

@@ -148,13 +148,13 @@ class Cell:
         What it said last may be of a moment before, when there was still something to command.
         """
 
-        def told():
+        def bridge_stands():
             message = self.messages.get('robot_bridge', '')
             halted = message and self.said['robot_bridge']['halted']
             return halted or 'planner is ' in message
 
         self.messages.pop('robot_bridge', None)
-        self.until(told, 'the bridge')
+        self.until(bridge_stands, 'the bridge')
 
     def _summary(self, node, message, values):
         self.said[node], self.messages[node] = values, message

@@ -50,8 +50,8 @@ def test_eight_configurations_are_visited_and_judged(start, client, tmp_path):
     assert words.startswith('8 configurations follow, some ')
     assert 'joint_1: none: looks like a sensor that was moved' in words
     size = expected['detectable_mm']['joint_2']
-    told = float(words.partition('joint_2: ')[2].split()[0])
-    assert abs(told / size - 1.0) < 0.3
+    shown_mm = float(words.partition('joint_2: ')[2].split()[0])
+    assert abs(shown_mm / size - 1.0) < 0.3
 
     session = cell.complete()
     m = session.measurements

@@ -72,10 +72,14 @@ def test_offsets_fitted_through_the_bridge_are_zero(start, client, tmp_path):
     limit = scipy.stats.t.ppf(1.0 - 0.5 * WRONG / known.sum(), freedom)
     assert np.all(np.abs((raw.joint_offsets - hidden) / raw.joint_offsets_std)[known] < limit)
     assert np.max(np.abs(raw.joint_offsets / raw.joint_offsets_std)[known]) > 10.0
-    left = fit_session(session.through_correction(), rng=np.random.default_rng(1), draws=400)
-    assert np.all(np.abs(left.joint_offsets / left.joint_offsets_std)[known] < limit)
+    corrected_fit = fit_session(
+        session.through_correction(), rng=np.random.default_rng(1), draws=400
+    )
+    assert np.all(
+        np.abs(corrected_fit.joint_offsets / corrected_fit.joint_offsets_std)[known] < limit
+    )
     # Hundredths of a degree would show: the offsets that are hidden are tenths.
-    assert limit * np.max(left.joint_offsets_std[known]) < np.deg2rad(0.05)
+    assert limit * np.max(corrected_fit.joint_offsets_std[known]) < np.deg2rad(0.05)
 
     assert verify(compensator, visits(session, cell.session)).verdict == 'in_use'
     done = remaster('replay', cell.session, '--out', tmp_path / 'again')

@@ -40,9 +40,9 @@ def test_a_designed_collection_goes_on_after_its_planner_was_killed(start, clien
     # A pose has one number, also where it was visited again for another of its solutions.
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     places = chain.forward(session.measurements.q)[:, :3, 3]
-    apart = np.linalg.norm(places[:, None] - places, axis=2) > 2e-3
+    is_other_place = np.linalg.norm(places[:, None] - places, axis=2) > 2e-3
     pose = session.measurements.pose
-    np.testing.assert_array_equal(apart, pose[:, None] != pose)
+    np.testing.assert_array_equal(is_other_place, pose[:, None] != pose)
     # The order of the journal, before and after the kill.
     records = read_journal(cell.session / 'plan.jsonl').records
     (order,) = [record['order'] for record in records if record.get('order')]

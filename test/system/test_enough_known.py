@@ -143,8 +143,8 @@ def test_a_collection_that_knows_enough_ends_as_any_other(start, client, tmp_pat
     assert set(m.pose[~m.is_validation].tolist()) == poses
     assert m.is_validation.any()
     ended = [e for e in cell.events if isinstance(e, ConfigurationEnded)]
-    whole = {(e.stamp, i) for e in announced for i in range(len(e.ids))}
-    assert {(e.stamp, e.solution) for e in ended} == whole, 'nothing was left half done'
+    solutions = {(e.stamp, i) for e in announced for i in range(len(e.ids))}
+    assert {(e.stamp, e.solution) for e in ended} == solutions, 'nothing was left half done'
     assert not [e for e in cell.events if isinstance(e, (ArmHalted, ArmStopped))]
     said = cell.said['pose_planner']
     assert said['state'] == 'complete'

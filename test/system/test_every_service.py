@@ -43,8 +43,8 @@ def test_the_optimizer_writes_figures_and_report_whatever_the_verdict(start, cli
         assert list((out / 'figures').glob('*.svg'))
     assert json.loads((causes / 'discovery.json').read_text())['verdict'] == 'undetermined'
     # What the data do not allow is an answer too.
-    whole = read_session(session)
-    few = whole.select(np.flatnonzero(whole.measurements.pose < 2))
+    full_session = read_session(session)
+    few = full_session.select(np.flatnonzero(full_session.measurements.pose < 2))
     for path in session.iterdir():
         path.unlink()
     write_session(session, few)
@@ -65,11 +65,11 @@ def test_a_second_call_while_the_first_is_at_work_is_answered(start, client, tmp
     # Which of two services is served first is not determined.
     asked = [caller.call_async(Trigger.Request()) for caller in callers]
     wait_until(lambda: client.spin_some() or any(f.done() for f in asked), 60, 'an answer')
-    told = next(future for future in asked if future.done())
-    assert not told.result().success
-    assert told.result().message == 'a fit is under way'
+    refusal = next(future for future in asked if future.done())
+    assert not refusal.result().success
+    assert refusal.result().message == 'a fit is under way'
     wait_until(lambda: client.spin_some() or all(f.done() for f in asked), 300, 'both answers')
-    (accepted,) = (future for future in asked if future is not told)
+    (accepted,) = (future for future in asked if future is not refusal)
     assert accepted.result().success, accepted.result().message
 
 

@@ -44,8 +44,8 @@ def test_one_required_sensor_is_enough_and_a_full_disk_is_waited_for(start, clie
         cell.until(lambda: 'room on the disk' in cell.recorder('waiting_for'), 'the reason')
         assert 'journal.jsonl: cannot be written' in cell.recorder('waiting_for')
         acknowledged = len(cell.results)
-        held = f'waiting for {cell.recorder("waiting_for")}'
-        cell.until(lambda: cell.messages['robot_bridge'] == held, 'the bridge')
+        message = f'waiting for {cell.recorder("waiting_for")}'
+        cell.until(lambda: cell.messages['robot_bridge'] == message, 'the bridge')
         recorded = len(read_session(cell.session).measurements)
         assert recorded == int(cell.recorder('observations'))
         assert len(cell.results) == acknowledged

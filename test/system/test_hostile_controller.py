@@ -49,8 +49,8 @@ def test_random_injections(tmp_path, curves):
     """HOSTILE_SEED=n draws others; the moments are never the same."""
     outcomes, broken = [], []
     campaign = in_parallel(SEED, INJECTIONS, tmp_path, RULES, DOMAINS, chunk=10, curves=curves)
-    for some, error in campaign:
-        outcomes += some
+    for chunk, error in campaign:
+        outcomes += chunk
         broken += [error] if error else []
     print(f'seed {SEED}')
     print(report(outcomes, RULES))

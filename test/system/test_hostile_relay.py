@@ -108,7 +108,7 @@ def relay(start, client, ros_environment, tmp_path):
     last.write(world.start_q, time.time_ns())
     command, data = free_ports(socket.SOCK_DGRAM, socket.SOCK_DGRAM)
     ports = {'command_port': command, 'data_port': data}
-    own = {
+    parameters = {
         'fake_robot': {'world': tmp_path / 'world', 'joint_state_rate': 100.0},
         'fake_optitrack': {'world': tmp_path / 'world', **ports},
         'optitrack_markers': ports,
@@ -124,9 +124,9 @@ def relay(start, client, ros_environment, tmp_path):
     }
     # The world must not wait for reports that the relay keeps.
     for name in ('robot_bridge', 'recorder'):
-        own[name]['simulated_clock_rate'] = 0.0
+        parameters[name]['simulated_clock_rate'] = 0.0
     between = Relay(client)
-    for name, values in own.items():
+    for name, values in parameters.items():
         named = {f'{name}:{key}': value for key, value in values.items()}
         arguments = node_arguments(ROOT / 'config' / 'fake.yaml', **named)
         if name == 'fake_robot':

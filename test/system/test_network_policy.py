@@ -69,8 +69,11 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
         values = {'use_sim_time': False, **OWN.get(name, {})}
         if name in ('pose_planner', 'recorder', 'optimizer'):
             values['session'] = tmp_path / 'session'
-        own = {f'{name}:{key}': value for key, value in values.items()}
-        start(f'remaster_ros.nodes.{name}', *node_arguments(ROOT / 'config' / 'fake.yaml', **own))
+        parameters = {f'{name}:{key}': value for key, value in values.items()}
+        start(
+            f'remaster_ros.nodes.{name}',
+            *node_arguments(ROOT / 'config' / 'fake.yaml', **parameters),
+        )
     looks = []
 
     def the_same_for_long():
@@ -84,13 +87,13 @@ def test_the_policy_is_what_the_nodes_use(start, client, tmp_path):
 
     wait_until(the_same_for_long, 60.0, 'six nodes')
     for name in NODES:
-        own, shown = allowed(name), looks[-1][name]
+        permitted, shown = allowed(name), looks[-1][name]
         if importlib.util.find_spec('tf2_msgs') is None:
-            own -= {('publish', '/tf_static')}
+            permitted -= {('publish', '/tf_static')}
         # There is one for each plan that waits for a confirmation; here none does.
-        own -= {('reply', PLANS), ('request', PLANS)}
-        assert shown - own == set(), f'{name} uses what the policy does not allow'
-        assert own - shown == set(), f'{name} is allowed what it does not use'
+        permitted -= {('reply', PLANS), ('request', PLANS)}
+        assert shown - permitted == set(), f'{name} uses what the policy does not allow'
+        assert permitted - shown == set(), f'{name} is allowed what it does not use'
     # While all of them run: RViz and Foxglove find what they are told to show.
     types = dict(client.get_topic_names_and_types())
     for topic, kind in viewer_configs.topics().items():

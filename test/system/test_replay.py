@@ -107,13 +107,13 @@ def test_a_controller_that_subscribes_later_receives_no_command(start, client, o
     from sensor_msgs.msg import JointState
     from trajectory_msgs.msg import JointTrajectory
 
-    heard, told = [], []
+    heard, commands = [], []
     client.create_subscription(JointState, '/joint_states', heard.append, 100)
     process = start('remaster_ros.cli.main', 'replay', old_bag, '--rate', '0.1', '--with-commands')
     until(client, lambda: heard, 60, 'the joint states')
-    client.create_subscription(JointTrajectory, COMMANDS, told.append, 100)
+    client.create_subscription(JointTrajectory, COMMANDS, commands.append, 100)
     assert f'/test_client listens to {COMMANDS}' in refusal(spun(client, process))
-    assert not told
+    assert not commands
 
 
 def test_a_robot_is_refused(start, client, old_bag):
@@ -189,7 +189,7 @@ def test_a_torn_end_is_told_and_ends_with_1(start, client, bag):
     client.create_subscription(JointState, '/joint_states', heard.append, 100)
     (file,) = bag.glob('*.mcap')
     (bag / 'SHA256SUMS').unlink(missing_ok=True)
-    whole = BagReader(bag).counts['/joint_states']
+    count = BagReader(bag).counts['/joint_states']
     data = file.read_bytes()
     # In the middle of a message, as a killed writer leaves it.
     file.write_bytes(data[: data.rindex(b'joint_7') - 10])
@@ -198,7 +198,7 @@ def test_a_torn_end_is_told_and_ends_with_1(start, client, bag):
     assert process.returncode == 1, out + err
     (line,) = (line for line in err.splitlines() if line.startswith('error:'))
     assert 'bytes of the bag are no whole message' in line
-    assert 0 < len(heard) < whole + 1
+    assert 0 < len(heard) < count + 1
 
 
 def test_messages_that_a_subscriber_does_not_take_are_told(monkeypatch, bag):

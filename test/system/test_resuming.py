@@ -24,9 +24,9 @@ def planner(cell, key):
     return cell.said.get('pose_planner', {}).get(key, '')
 
 
-def restart(cell, *others):
+def restart(cell, *names):
     """Kill the planner and others and start them again; wait for the new planner's decision."""
-    restarted = (*others, 'pose_planner')
+    restarted = (*names, 'pose_planner')
     before = {name: cell.said[name]['started'] for name in restarted}
     for name in restarted:
         cell.nodes[name].kill()

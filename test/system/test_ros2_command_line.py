@@ -87,13 +87,13 @@ def test_a_bag_names_nothing_that_moves_an_arm(session_bag):
 def test_ros2_bag_play_moves_nothing(client, session_bag, ros_environment):
     from trajectory_msgs.msg import JointTrajectory
 
-    told = []
+    commands = []
     for topic in (COMMANDS, '/remaster/joint_solutions'):
-        client.create_subscription(JointTrajectory, topic, told.append, 100)
+        client.create_subscription(JointTrajectory, topic, commands.append, 100)
     played = ros2(ros_environment, 'bag', 'play', session_bag)
     assert played.returncode == 0, played.stderr
     until(client, lambda: True, 5, 'what is left')
-    assert not told
+    assert not commands
 
 
 @needs_ros2
@@ -105,14 +105,14 @@ def test_ros2_bag_play_of_an_old_bag_with_the_topics_excluded(client, tmp_path, 
     with BagWriter(tmp_path / 'old') as writer:
         for topic in (COMMANDS, '/remaster/joint_solutions'):
             writer.write(topic, 'trajectory_msgs/msg/JointTrajectory', data, 10**18)
-    told = []
+    commands = []
     for topic in (COMMANDS, '/remaster/joint_solutions'):
-        client.create_subscription(JointTrajectory, topic, told.append, 100)
+        client.create_subscription(JointTrajectory, topic, commands.append, 100)
     excluded = ('--exclude-topics', COMMANDS, '/remaster/joint_solutions')
     played = ros2(ros_environment, 'bag', 'play', tmp_path / 'old', *excluded)
     assert played.returncode == 0, played.stderr
     until(client, lambda: True, 5, 'what is left')
-    assert not told
+    assert not commands
 
 
 @pytest.mark.parametrize('key', ['/**/recorder', '/left/recorder'])

@@ -44,10 +44,10 @@ def test_reflectors_are_measured_one_after_another(start, client, tmp_path):
     of = [names[m.configuration == number].tolist() for number in np.unique(m.configuration)]
     assert all(len(set(found)) == len(found) for found in of), of
     assert len(of) == cell.planned() > 5
-    whole = [found for found in of if len(found) == 2]
-    assert 2 <= len(of) - len(whole) < len(of) - 3, of
+    pairs = [found for found in of if len(found) == 2]
+    assert 2 <= len(of) - len(pairs) < len(of) - 3, of
     # The one that was measured last is measured first.
-    assert {tuple(found) for found in whole} == {('smr', 'smr_2'), ('smr_2', 'smr')}
+    assert {tuple(found) for found in pairs} == {('smr', 'smr_2'), ('smr_2', 'smr')}
     # Each has a time of its own, and they share no frame.
     assert len(set(m.stamp_s.tolist())) == len(m)
     assert np.all(m.frame == -1)

@@ -38,17 +38,17 @@ def test_what_an_editor_did_is_undone_and_a_renamed_folder_holds_the_arm(start, 
     assert rows(cell) > 2
 
     with path.open('r+b') as file:
-        whole = file.read()
-        place = whole.rfind(b',0.') + 3
+        data = file.read()
+        place = data.rfind(b',0.') + 3
         file.seek(place)
-        file.write(b'8' if whole[place : place + 1] != b'8' else b'7')
+        file.write(b'8' if data[place : place + 1] != b'8' else b'7')
     cell.until(lambda: 'was changed' in cell.recorder('restored'), 'the digit', SOON_S)
-    assert path.read_bytes().startswith(whole)
+    assert path.read_bytes().startswith(data)
 
     cell.session.rename(tmp_path / 'elsewhere')
     cell.until(lambda: 'put it back' in cell.recorder('waiting_for'), 'the folder', SOON_S)
-    held = f'waiting for {cell.recorder("waiting_for")}'
-    cell.until(lambda: cell.messages['robot_bridge'] == held, 'the bridge', SOON_S)
+    message = f'waiting for {cell.recorder("waiting_for")}'
+    cell.until(lambda: cell.messages['robot_bridge'] == message, 'the bridge', SOON_S)
     acknowledged = len(cell.results)
     time.sleep(2.0)
     assert len(cell.results) == acknowledged

@@ -40,7 +40,7 @@ class OneCell:
         )
         command, data = free_ports(socket.SOCK_DGRAM, socket.SOCK_DGRAM)
         ports = {'command_port': command, 'data_port': data}
-        own = {
+        parameters = {
             'fake_robot': {'rate': 10.0, 'seed': SEEDS[name]},
             'fake_optitrack': ports,
             'optitrack_markers': ports,
@@ -59,7 +59,7 @@ class OneCell:
             },
         }
         self.processes = {}
-        for node, values in own.items():
+        for node, values in parameters.items():
             args = ['--ros-args', '-r', f'__ns:=/{name}', '-r', '/clock:=clock']
             args += ['--params-file', ROOT / 'config' / 'fake.yaml']
             # On the command line a node's name has no namespace, so that the values are in a file.

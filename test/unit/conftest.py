@@ -135,14 +135,14 @@ def full_disk(monkeypatch):
 
     @contextmanager
     def full(room=0):
-        write, left = os.write, room
+        write, free = os.write, room
 
         def limited(descriptor, data):
-            nonlocal left
-            if not left:
+            nonlocal free
+            if not free:
                 raise OSError(errno.ENOSPC, 'No space left on device')
-            written = write(descriptor, bytes(data[:left]))
-            left -= written
+            written = write(descriptor, bytes(data[:free]))
+            free -= written
             return written
 
         with monkeypatch.context() as patch:

@@ -137,11 +137,11 @@ def test_readings_that_err_have_a_place_of_their_own(
 
 def test_sizes_are_compared_by_the_names_of_the_kind(six: HiddenWorld) -> None:
     truth = truth_of(six, SCALE)
-    near, far = (
+    near_claim, far = (
         claim('encoder_scale', 'joint_angle', 'joint_angle', (2,), scale_2=value)
         for value in (1.1e-3, 2e-3)
     )
-    assert judge(six, truth, discovery(near)).size_right is True
+    assert judge(six, truth, discovery(near_claim)).size_right is True
     assert judge(six, truth, discovery(far)).size_right is False
 
 

@@ -58,8 +58,8 @@ def test_rviz_of_a_cell_shows_its_own_sensors(tmp_path):
     shipped = config_path('cells/demo.yaml')
     text = shipped.read_text(encoding='utf-8').replace('../robots', str(config_path('robots')))
     # One sensor of another name, a camera on the tool, and no tracker.
-    head, rest = text.split('  mocap:', 1)
-    _, tail = rest.split('# The tool', 1)
+    head, remainder = text.split('  mocap:', 1)
+    _, tail = remainder.split('# The tool', 1)
     tail = tail.replace('aim_at: tracker', 'aim_at: bar')
     bar = '  bar: {marker: smr, topic: hall/bar, rough_position_m: [1.9, 0.0, 1.3]}'
     cell = tmp_path / 'cell.yaml'

@@ -38,7 +38,7 @@ def spoilt(session, q=lambda q: q, points=lambda points: points):
     return replace(session, measurements=replace(m, q=q(m.q), position=points(m.position)))
 
 
-def one(joints, joint, value, otherwise):
+def only_at(joints, joint, value, otherwise):
     return tuple(value if i == joint else otherwise for i in range(joints))
 
 

@@ -56,9 +56,9 @@ def test_weights_are_smoothed_as_by_arviz(array_stats) -> None:
     np.testing.assert_allclose(alike.weight, 0.01)
 
 
-@pytest.mark.parametrize('others', [-800.0, -700.0, -300.0, -np.inf])
-def test_one_weight_that_is_all_of_them_stays_a_number(others: float) -> None:
-    log_weight = np.append(0.0, np.full(999, others) + 1e-3 * np.arange(999))
+@pytest.mark.parametrize('other_log_weight', [-800.0, -700.0, -300.0, -np.inf])
+def test_one_weight_that_is_all_of_them_stays_a_number(other_log_weight: float) -> None:
+    log_weight = np.append(0.0, np.full(999, other_log_weight) + 1e-3 * np.arange(999))
     drawn = Weighted.of(np.zeros((1000, 1)), log_weight)
     assert np.isfinite(drawn.weight).all()
     assert drawn.effective == pytest.approx(1.0, abs=0.02)

@@ -84,8 +84,8 @@ def test_the_mode_is_the_same_from_where_the_effects_were_searched(sagging) -> N
     np.testing.assert_array_equal(again.posterior.free, free)
     # The reference of the registrations is another one: what does not depend on it.
     same = free[(free < found.model.joints) | (free >= found.model.core - 3)]
-    apart = again.model.natural(again.mode.z)[same] - x[same]
-    assert np.max(np.abs(apart) / std[np.isin(free, same)]) < 0.02
+    difference = again.model.natural(again.mode.z)[same] - x[same]
+    assert np.max(np.abs(difference) / std[np.isin(free, same)]) < 0.02
     assert again.mode.log_evidence == pytest.approx(found.mode.log_evidence, abs=0.01)
     assert again.left_out == found.left_out
 
@@ -168,8 +168,8 @@ def test_an_offset_that_an_effect_leaves_open_stays_where_the_effects_were_searc
     twin = extension(**{**arrays, 'joint': joint, 'prior_precision': np.diag([1.0, 0.0, 0.0])})
     free = estimate(Problem.of(session), twin)
     searched = free.model.offsets(free.mode.z) + np.radians(3.0)
-    near = replace(twin, joint_offsets=searched, step_std=np.radians(std_deg))
-    found = estimate(Problem.of(session), near)
+    anchored_extension = replace(twin, joint_offsets=searched, step_std=np.radians(std_deg))
+    found = estimate(Problem.of(session), anchored_extension)
     # The effect, of 1 rad, takes up what the offset does not.
     index = int(np.flatnonzero(found.posterior.free == 2)[0])
     std = np.sqrt(found.mode.covariance[index, index])

@@ -67,19 +67,19 @@ def test_a_pose_left_out_is_judged_as_by_a_fit_without_it():
     for number, chosen in enumerate(np.unique(pose)):
         out = pose == chosen
         P = np.linalg.inv(precision - X[out].T @ X[out])
-        rest = e + X @ P @ (X[out].T @ e[out])
+        residuals = e + X @ P @ (X[out].T @ e[out])
         for index in (0, 1):
             groups = np.unique(pose[sensor == index])
             rows = {g: np.flatnonzero((sensor == index) & (pose == g)) for g in groups}
             for is_mean in (True, False):
                 basis = {g: directions(len(r) // 3, is_mean) for g, r in rows.items()}
-                others = [g for g in groups if g != chosen]
-                Q = block_diag(*(basis[g] for g in others))
-                at = np.concatenate([rows[g] for g in others])
+                kept_poses = [g for g in groups if g != chosen]
+                Q = block_diag(*(basis[g] for g in kept_poses))
+                at = np.concatenate([rows[g] for g in kept_poses])
                 W = Q @ X[at]
-                noise = np.sum((Q @ rest[at]) ** 2) / (len(Q) - np.sum((W @ P) * W))
-                own = basis[chosen]
-                V, d = own @ X[rows[chosen]], own @ rest[rows[chosen]]
+                noise = np.sum((Q @ residuals[at]) ** 2) / (len(Q) - np.sum((W @ P) * W))
+                directions_out = basis[chosen]
+                V, d = directions_out @ X[rows[chosen]], directions_out @ residuals[rows[chosen]]
                 expected = d @ np.linalg.solve(np.eye(len(d)) + V @ P @ V.T, d) / len(d) / noise
                 assert judged[2 * index + is_mean][number] == pytest.approx(expected, rel=1e-6)
 

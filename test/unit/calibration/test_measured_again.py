@@ -36,9 +36,9 @@ def healthy(validation: int) -> Session:
     return scene(12, poses=20, validation=validation, sigma_m=0.1e-3, pose_sigma_m=0.05e-3)[0]
 
 
-@pytest.mark.parametrize(('away', 'same'), [(0.8, True), (1.2, False)])
-def test_configurations_are_compared_by_their_joint_angles(away: float, same: bool) -> None:
-    m = again(healthy(6).measurements, 4, away * SAME_RAD)
+@pytest.mark.parametrize(('distance', 'same'), [(0.8, True), (1.2, False)])
+def test_configurations_are_compared_by_their_joint_angles(distance: float, same: bool) -> None:
+    m = again(healthy(6).measurements, 4, distance * SAME_RAD)
     counted = MeasuredAgain.of(m)
     copies = len(np.unique(m.configuration[m.pose >= 1000]))
     assert counted.again == (copies if same else 0)

@@ -59,12 +59,12 @@ def test_walk_is_hastings_rule_step_by_step(share: float) -> None:
         for current in (-np.inf, 0.3):
             weight = np.where(rng.random(length) < share, -np.inf, rng.standard_normal(length))
             uniform = np.log(rng.random(length))
-            here, held, path = -1, current, []
+            here, log_density, path = -1, current, []
             for step in range(length):
                 # A state without density is left for any that has one.
                 nowhere = np.isneginf(weight[step])
-                if not nowhere and uniform[step] < weight[step] - held:
-                    here, held = step, weight[step]
+                if not nowhere and uniform[step] < weight[step] - log_density:
+                    here, log_density = step, weight[step]
                 path.append(here)
             assert _states_of_chain(weight, uniform, current) == path
 

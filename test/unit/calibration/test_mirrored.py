@@ -34,8 +34,8 @@ def test_two_axes_turned_round_are_a_turn_of_the_sensor() -> None:
     found = estimate(Problem.of(mirrored(session, 0, (-1, -1, 1))))
     std = np.sqrt(np.diag(found.mode.covariance))[: len(found.posterior.free)]
     joints = found.posterior.free[found.posterior.free < 6]
-    away = found.mode.z[joints] - truth.joint_offsets[joints]
-    assert np.all(np.abs(away) < 5.0 * std[: len(joints)])
+    error = found.mode.z[joints] - truth.joint_offsets[joints]
+    assert np.all(np.abs(error) < 5.0 * std[: len(joints)])
 
 
 @pytest.mark.parametrize('joint', [1, 3, 4])

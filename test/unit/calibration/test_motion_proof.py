@@ -89,19 +89,19 @@ def test_without_motion_or_with_few_standstills_nothing_is_judged():
     assert motion_proof(replace(m, is_validation=m.pose >= POSES - 2), errors, zero, zero) is None
 
 
-def share_at_rest(turned, rest=0.2, travel=3e-4):
+def share_at_rest(turned, rest_angle=0.2, travel=3e-4):
     """Return the share of the friction of one joint at rest that turned last at a place."""
     zero = np.zeros((1, 1))
-    place, way = np.array([[rest]]), np.array([[turned]])
+    place, way = np.array([[rest_angle]]), np.array([[turned]])
     return friction_share(np.zeros(1), place, zero, zero, np.array([travel]), way)[0, 0]
 
 
 @pytest.mark.parametrize('turned', [0.1, 0.2004, 0.1999, 0.20002])
 def test_friction_at_rest_is_that_of_the_last_turn(turned):
     """Dahl's model: from far away to where it turned, and back to where it rests."""
-    share, travel, rest = 0.0, 3e-4, 0.2
-    side = np.sign(turned - rest)
-    for start, end in ((turned - 0.05 * side, turned), (turned, rest)):
+    share, travel, place = 0.0, 3e-4, 0.2
+    side = np.sign(turned - place)
+    for start, end in ((turned - 0.05 * side, turned), (turned, place)):
         along = np.sign(end - start)
         share = along + (share - along) * np.exp(-abs(end - start) / travel)
     assert share_at_rest(turned) == pytest.approx(share, abs=1e-9)

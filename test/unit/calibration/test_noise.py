@@ -33,8 +33,8 @@ def rows_of_frames() -> tuple[Rows, np.ndarray]:
     kept[-int(several.sum()) :] = ~hidden[several]
     source = source[kept]
     frame = np.where(measurements.sensor == 0, measurements.configuration, -1)
-    many = replace(measurements, frame=frame).select(source)
-    rows = Rows.of(many, np.arange(len(many)), found.model.reference)
+    framed_rows = replace(measurements, frame=frame).select(source)
+    rows = Rows.of(framed_rows, np.arange(len(framed_rows)), found.model.reference)
     return rows, found.model.reference
 
 
@@ -98,9 +98,11 @@ def test_gram_matrices_do_not_depend_on_the_blocks(monkeypatch):
     rows, reference = rows_of_two_sensors()
     model = NoiseModel.of(rows, reference, (1,))
     vectors = np.random.default_rng(5).standard_normal((len(rows), 3, 4))
-    whole = model.gram(lambda _, where: vectors[where], 4)
+    full_gram = model.gram(lambda _, where: vectors[where], 4)
     monkeypatch.setattr('remaster_ros.calibration.noise.GRAM_ROWS', 7)
-    np.testing.assert_allclose(model.gram(lambda _, where: vectors[where], 4), whole, rtol=1e-9)
+    np.testing.assert_allclose(
+        model.gram(lambda _, where: vectors[where], 4), full_gram, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize('given', [rows_of_two_sensors, rows_of_frames])
@@ -110,8 +112,8 @@ def test_rows_are_whitened_some_at_a_time_to_where_they_are_wanted(given, monkey
     noise = a_noise(model)
     vectors = np.random.default_rng(4).standard_normal((len(rows), 3, 5)).astype(np.float32)
     monkeypatch.setattr('remaster_ros.calibration.noise.WHITENED_ROWS', len(rows) + 1)
-    whole = model.whitened(vectors, noise)
+    full_rows = model.whitened(vectors, noise)
     monkeypatch.setattr('remaster_ros.calibration.noise.WHITENED_ROWS', 5)
     room = np.empty_like(vectors)
     assert model.whitened(vectors, noise, room) is room
-    np.testing.assert_array_equal(room, whole)
+    np.testing.assert_array_equal(room, full_rows)

@@ -96,13 +96,13 @@ def test_the_noise_of_a_reading_is_that_of_the_mean_of_its_frames(samples):
     """The scatter of the frames, 0.1 mm, is a fact about frames; no pose has two readings."""
     frames = 0.1e-3
     m = measurements(frames / np.sqrt(samples), samples=samples)
-    alone = replace(m, pose=np.arange(len(m)))
-    found = check(alone, noise(frames / np.sqrt(samples), 0.0))
+    single_rows = replace(m, pose=np.arange(len(m)))
+    found = check(single_rows, noise(frames / np.sqrt(samples), 0.0))
     assert found.stated_std_m == pytest.approx(frames / np.sqrt(samples))
     assert found.noise_m == pytest.approx(found.after_m, rel=0.15)
     assert found.explained
     # Errors as large as the scatter of the frames are more than 16 or 120 frames leave.
-    assert check(alone, noise(frames, 0.0)).explained == (samples == 1)
+    assert check(single_rows, noise(frames, 0.0)).explained == (samples == 1)
 
 
 def test_samples_that_are_not_known_count_as_one():
@@ -144,11 +144,11 @@ def test_held_out_rows_are_judged_where_there_are_any():
 
 def test_without_std_and_second_solutions_nothing_tells():
     m = measurements()
-    alone = replace(m, pose=np.arange(len(m)))
-    found = check(alone, noise(0.1e-3, 0.0))
+    single_rows = replace(m, pose=np.arange(len(m)))
+    found = check(single_rows, noise(0.1e-3, 0.0))
     assert found.noise_std_m is found.noise_m is None
     assert found.explained is None
-    assert check(replace(alone, std=np.full((len(m), 3), 1e-3)), noise(1e-4, 0.0)).explained
+    assert check(replace(single_rows, std=np.full((len(m), 3), 1e-3)), noise(1e-4, 0.0)).explained
 
 
 def test_two_markers_at_one_configuration_are_no_second_solution():
@@ -162,12 +162,12 @@ def test_every_sensor_is_judged_by_its_own_noise():
     sensor = np.arange(len(m)) % 2
     errors[sensor == 1] *= 0.02
     errors[sensor == 1] += [0.15e-3, 0.0, 0.0]
-    first, second, *rest = check_noise(
+    first, second, *further_checks = check_noise(
         replace(m, sensor=sensor), ('mocap', 'tracker', 'off'), errors, np.array([], int), 14
     )
     assert (first.sensor, first.explained) == ('mocap', True)
     assert (second.sensor, second.explained) == ('tracker', False)
-    assert rest == []
+    assert further_checks == []
 
 
 def test_held_out_gross_errors_that_make_up_the_error_are_named_and_not_green():

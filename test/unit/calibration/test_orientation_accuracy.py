@@ -75,9 +75,11 @@ def test_how_the_body_stands_on_the_tool_makes_no_difference(made):
         for rpy in ((0.0, 0.0, 0.0), (3.0, 1.2, -2.0))
     ]
     for metric in METRICS:
-        one, other = (accuracy['validation'][metric]['before']['mean_deg'] for accuracy in pairs)
+        plain_deg, turned_deg = (
+            accuracy['validation'][metric]['before']['mean_deg'] for accuracy in pairs
+        )
         # The noise is turned with the body, and differs.
-        assert one == pytest.approx(other, rel=0.05)
+        assert plain_deg == pytest.approx(turned_deg, rel=0.05)
 
 
 def test_without_orientations_there_are_no_metrics_of_them(made):

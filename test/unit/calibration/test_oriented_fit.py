@@ -74,10 +74,10 @@ def test_intervals_of_an_arm_that_slides_hold_as_often_as_they_say(arm, sessions
     found = [
         one_session(seed, 'tracker', arm=SLIDING[arm]) for seed in range(9500, 9500 + sessions)
     ]
-    inside = np.concatenate([one.inside for one in found])
+    inside = np.concatenate([result.inside for result in found])
     low, high = binom.ppf((0.5 * ERROR_RATE, 1.0 - 0.5 * ERROR_RATE), len(inside) // 2, 0.95)
     assert low <= inside.mean() * (len(inside) // 2) <= high
-    assert np.abs(np.concatenate([one.scaled for one in found])).max() < 4.5
+    assert np.abs(np.concatenate([result.scaled for result in found])).max() < 4.5
 
 
 @pytest.mark.parametrize('sessions', [2, pytest.param(200, marks=pytest.mark.qualify)])
@@ -86,16 +86,16 @@ def test_intervals_hold_as_often_as_they_say(kind, sessions):
     print(f'session seeds 9000 to {9000 + sessions - 1}')
     jobs = [(seed, kind) for seed in range(9000, 9000 + sessions)]
     found = list(in_parallel(result_of_session, jobs, 2 if sessions > 4 else 1))
-    inside = np.concatenate([one.inside for one in found])
+    inside = np.concatenate([result.inside for result in found])
     # The offsets of one session hang together: as if they were half as many.
     count = len(inside) // 2
     low, high = binom.ppf((0.5 * ERROR_RATE, 1.0 - 0.5 * ERROR_RATE), count, 0.95) / count
     assert low <= inside.mean() <= high
-    assert sum(one.gross for one in found) <= 0.01 * 90 * sessions
+    assert sum(result.gross for result in found) <= 0.01 * 90 * sessions
     # Orientations add to what the positions tell, and disagree no more often than by chance.
-    gain = [np.divide(one.std_deg, one.without_deg) for one in found]
+    gain = [np.divide(result.std_deg, result.without_deg) for result in found]
     assert np.median(np.concatenate(gain)) < 1.0
-    disagree = sum(one.p_value < 0.01 for one in found)
+    disagree = sum(result.p_value < 0.01 for result in found)
     assert disagree <= binom.ppf(1.0 - ERROR_RATE, sessions, 0.02)
 
 
@@ -104,12 +104,12 @@ def test_without_orientations_it_is_the_same_fit_to_the_last_bit():
     m = session.measurements
     few = np.full_like(m.orientation, np.nan)
     few[:3] = m.orientation[:3]
-    one, other = (
+    plain_fit, other = (
         fit_session(replace(session, measurements=replace(m, orientation=turned)), rng=rng)
         for turned, rng in ((None, np.random.default_rng(0)), (few, np.random.default_rng(0)))
     )
-    np.testing.assert_array_equal(one.draws, other.draws)
-    assert one.orientations is None
+    np.testing.assert_array_equal(plain_fit.draws, other.draws)
+    assert plain_fit.orientations is None
     assert 'fewer than 4' in other.orientations_in_words
 
 
@@ -135,9 +135,9 @@ def test_another_order_of_the_quaternion_is_named_and_the_positions_are_fitted()
     m = session.measurements
     mixed = replace(session, measurements=replace(m, orientation=m.orientation[:, [3, 0, 1, 2]]))
     fit = fitted(mixed)
-    alone = fitted(session.positions_alone())
+    plain_fit = fitted(session.positions_alone())
     assert 'order x, y, z, w' in fit.orientations_in_words
-    np.testing.assert_array_equal(fit.joint_offsets, alone.joint_offsets)
+    np.testing.assert_array_equal(fit.joint_offsets, plain_fit.joint_offsets)
     content = fit_content(fit)
     assert content.orientation.fitted is False
     assert content.orientation.why
@@ -179,8 +179,8 @@ def test_report_and_file_tell_that_they_were_used_and_how_sure():
     chain = fit.chain
     axis = chain.T_fixed[-1][:3, :3].T @ chain.axes[-1]
     turn = Rotation.from_rotvec(axis * made.joint_offsets[-1]).as_matrix() @ made.R_T_B
-    away = (Rotation.from_matrix(turn).inv() * Rotation.from_quat(body.rotation_xyzw)).magnitude()
-    assert np.degrees(away) < 4.0 * np.linalg.norm(body.std_deg)
+    angle = (Rotation.from_matrix(turn).inv() * Rotation.from_quat(body.rotation_xyzw)).magnitude()
+    assert np.degrees(angle) < 4.0 * np.linalg.norm(body.std_deg)
     assert 'orientations are fitted' in '\n'.join(fit_lines(fit_content(fit)))
     assert all(
         found.std_positions_deg[row.joint] > 0.9 * row.std_if_exactly_drawn_deg

@@ -35,15 +35,15 @@ def rows():
 def noise_of(frames, order):
     rng = np.random.default_rng(1)
     path = np.cumsum(rng.normal(0.0, 0.02, (frames, 3)), axis=0)
-    one = np.ones(1)
+    unit = np.ones(1)
     return PathNoise(
         np.repeat(path, MARKERS, axis=0),
         np.zeros((frames * MARKERS, 9)),
-        0.9 * one,
-        0.5 * one,
-        0.1 * one,
-        0.5 * one,
-        one,
+        0.9 * unit,
+        0.5 * unit,
+        0.1 * unit,
+        0.5 * unit,
+        unit,
         np.array([order]),
     )
 
@@ -55,13 +55,13 @@ def test_correlated_errors_become_independent(rows, order):
     source = np.arange(0, len(rows), MARKERS)
     of_frames, of_markers = noise.of_frames(0, source), noise.of_markers(0, source)
     member = np.repeat(np.eye(FRAMES), MARKERS, axis=0)
-    apart = np.eye(MARKERS) - 1.0 / MARKERS
-    covariance = 0.25 * member @ of_frames @ member.T + np.kron(of_markers, apart)
+    centering = np.eye(MARKERS) - 1.0 / MARKERS
+    covariance = 0.25 * member @ of_frames @ member.T + np.kron(of_markers, centering)
     along = rows.along_path(noise)
     white = along.decorrelated(np.repeat(np.eye(len(rows))[:, None, :], 3, axis=1))[:, 0, :]
     scatter = 1.0 - scatterless(of_frames), 1.0 - scatterless(of_markers)
     expected = 0.25 * scatter[0] * member @ member.T
-    expected += scatter[1] * np.kron(np.eye(FRAMES), apart)
+    expected += scatter[1] * np.kron(np.eye(FRAMES), centering)
     np.testing.assert_allclose(white @ covariance @ white.T, expected, atol=1e-9)
 
 

@@ -106,9 +106,9 @@ def test_mode_is_where_the_exact_density_peaks(found) -> None:
     width = np.sqrt(np.diag(mode.covariance))
     for index, std in enumerate(width):
         for sign in (0.5, -0.5):
-            beside = top.copy()
-            beside[index] += sign * std
-            assert posterior.log_density(beside[None])[0] < value
+            moved_point = top.copy()
+            moved_point[index] += sign * std
+            assert posterior.log_density(moved_point[None])[0] < value
 
 
 @pytest.mark.parametrize('along', [(), (0,)])
@@ -278,9 +278,9 @@ def test_steps_that_settle_slowly_are_near_enough_and_none_at_all_is_refused(mon
     posterior = estimate(Problem.of(scene(47, poses=12)[0])).posterior
     usual = find_mode(posterior)
     monkeypatch.setattr(laplace, 'SETTLED', 0.0)
-    near = find_mode(posterior)
+    unsettled_mode = find_mode(posterior)
     std = np.sqrt(np.diag(usual.covariance))
-    off = near.z[posterior.free] - usual.z[posterior.free]
+    off = unsettled_mode.z[posterior.free] - usual.z[posterior.free]
     assert np.all(np.abs(off) < 1e-2 * std[: len(off)])
     monkeypatch.setattr(laplace, 'NEAR_ENOUGH', 0.0)
     with pytest.raises(InsufficientDataError, match='does not settle'):

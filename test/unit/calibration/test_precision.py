@@ -49,8 +49,8 @@ def test_few_data_leave_the_noise_open_and_the_parameters_with_it():
 
 
 def test_so_many_times_the_data_reach_a_goal_and_not_fewer():
-    few, many = precision(24), precision(48)
-    times = few.times_the_data(many.joint_rms, None)
+    few, many_poses = precision(24), precision(48)
+    times = few.times_the_data(many_poses.joint_rms, None)
     # The second half of the poses tells about as much as the first.
     assert 1.5 < times < 3.0
     assert few.times_the_data(few.joint_rms * 1.001, few.tool_rms * 1.001) == 1.0

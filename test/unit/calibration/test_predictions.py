@@ -55,9 +55,11 @@ def test_errors_with_long_tails_widen_the_regions():
     fit, measurements, found = predicted(session)
     assert found.widening > 1.03
     held_out = measurements.is_validation
-    left = fit.residuals_after
+    residuals = fit.residuals_after
     narrow = found.covariance / found.widening**2
-    distance = np.einsum('ni,ni->n', left, np.linalg.solve(narrow, left[..., None])[..., 0])
+    distance = np.einsum(
+        'ni,ni->n', residuals, np.linalg.solve(narrow, residuals[..., None])[..., 0]
+    )
     without = np.mean(distance[held_out] <= chi2.ppf(0.95, 3))
     print(found.widening, without, np.mean(found.inside[held_out]))
     assert without < np.mean(found.inside[held_out])

@@ -148,10 +148,10 @@ def test_further_effects_stay_out_of_random_configurations(seen: Measurements) -
         draws=np.column_stack((bare.draws, np.full(DRAWS, 1e-3))),
     )
     invariant, _ = distances(given, seen)
-    alone, _ = distances(bare, seen)
-    assert invariant.after.mean() > 2 * alone.after.mean()
+    bare_distances, _ = distances(bare, seen)
+    assert invariant.after.mean() > 2 * bare_distances.after.mean()
     same, _ = distances(given.without_extension(), seen)
-    np.testing.assert_array_equal(same.after, alone.after)
+    np.testing.assert_array_equal(same.after, bare_distances.after)
 
 
 def test_the_map_has_the_error_that_a_joint_makes_at_each_place(seen: Measurements) -> None:
@@ -166,7 +166,7 @@ def test_the_map_has_the_error_that_a_joint_makes_at_each_place(seen: Measuremen
             for angle in (0.0, 1e-3)
         ]
         still = [turned[0], turned[2]]
-        which = int(np.argmin([np.linalg.norm(place - one) for one in still]))
+        which = int(np.argmin([np.linalg.norm(place - point) for point in still]))
         np.testing.assert_allclose(place, still[which], atol=1e-12)
         moved = np.linalg.norm(turned[2 * which + 1] - turned[2 * which])
         # 300 draws know the mean of |x| to 4.4 %: five standard errors.

@@ -37,9 +37,9 @@ def test_noise_is_averaged_and_reported():
     rng, T_R_N, points_R, points_N = random_case(11, 400)
     found, rms = register_points(points_R, points_N + rng.normal(0, noise, points_N.shape))
     assert rms == pytest.approx(noise * np.sqrt(3 * (1 - 6 / 1200)), rel=0.1)
-    left = inverse(T_R_N) @ found
+    error = inverse(T_R_N) @ found
     # Six sigma of the angle over points 0.5 m wide; the translation lies up to 5 m from them.
-    assert np.linalg.norm(matrix_to_rotation_vector(left[:3, :3])) < 6 * noise / (
+    assert np.linalg.norm(matrix_to_rotation_vector(error[:3, :3])) < 6 * noise / (
         0.29 * np.sqrt(400)
     )
     center = points_R.mean(axis=0)

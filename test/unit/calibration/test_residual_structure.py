@@ -43,8 +43,8 @@ def noise(m: Measurements, rng: np.random.Generator) -> FloatArray:
 
 def lens(m: Measurements, rng: np.random.Generator) -> FloatArray:
     """A cubic radial distortion about the mean place, 0.2 mm RMS."""
-    apart = m.position - m.position.mean(axis=0)
-    cubic = apart * np.sum(apart**2, axis=1)[:, None]
+    offset = m.position - m.position.mean(axis=0)
+    cubic = offset * np.sum(offset**2, axis=1)[:, None]
     return noise(m, rng) + 0.2e-3 * cubic / np.sqrt(np.mean(np.sum(cubic**2, axis=1)))
 
 

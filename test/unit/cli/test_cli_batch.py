@@ -87,8 +87,8 @@ def test_rows_do_not_depend_on_the_workers_and_are_not_made_again(
     (cause,) = row['discovery']['effects']
     assert (cause['name'], cause['joints']) == ('joint_compliance', [2])
     (folder,), (other,) = [fit.parent for fit in out.glob('*/fit')], by_two.glob('s1-*')
-    told = json.loads((folder / 'discovery' / 'discovery.json').read_bytes())['effects']
-    assert cause['size_mm'] == 1e3 * told[0]['size_m'] > 0.1
+    effects = json.loads((folder / 'discovery' / 'discovery.json').read_bytes())['effects']
+    assert cause['size_mm'] == 1e3 * effects[0]['size_m'] > 0.1
     assert row == rows(by_two)[s1]
     for file in ('fit/fit.json', 'discovery/discovery.json', 'fit/apply/compensation.json'):
         assert (folder / file).read_bytes() == (other / file).read_bytes()
@@ -151,13 +151,13 @@ def test_copies_are_worked_on_once_and_each_has_its_name(sessions, by_one, tmp_p
     assert (out / batch.ROWS).read_bytes() == before
     # Against the correction of one session, made of each: another arm's, and its own.
     (baseline,) = out.glob('*/fit/apply/compensation.json')
-    other, own = sessions / 's2', sessions / 's1'
+    other, source = sessions / 's2', sessions / 's1'
     job = batch.Job('', str(other), '', 0, str(baseline))
     found = batch._of_check(job, read_session(other))
     assert found['verdict'] == 'unclear', 'offsets of half a degree lie between the two arms'
-    assert [one['joint'] for one in found['joints']] == [f'joint_{i}' for i in range(1, 8)]
+    assert [joint['joint'] for joint in found['joints']] == [f'joint_{i}' for i in range(1, 8)]
     with pytest.raises(InputError, match='is the session that the correction was made of'):
-        batch._of_check(job, read_session(own))
+        batch._of_check(job, read_session(source))
 
 
 def test_an_error_that_is_none_of_the_session_is_tried_again(sessions, by_one):
@@ -342,9 +342,9 @@ def test_what_a_slide_is_off_by_is_summed_up_in_mm():
     offsets[6:, 1] += 0.3
     rows = [made_row(f's{i}', row) for i, row in enumerate(offsets.tolist())]
     for row in rows:
-        one = row['fit']['joints'][1]
-        one |= {'unit': 'mm', 'mean_mm': one['mean_deg'], 'std_mm': 0.01}
-        one |= {'mean_deg': None, 'std_deg': None}
+        joint = row['fit']['joints'][1]
+        joint |= {'unit': 'mm', 'mean_mm': joint['mean_deg'], 'std_mm': 0.01}
+        joint |= {'mean_deg': None, 'std_deg': None}
     found = summary_of(rows)
     j0, j1, _ = found['joints']
     assert (j0['unit'], j1['unit']) == ('deg', 'mm')
@@ -364,7 +364,7 @@ def test_arms_that_scatter_are_not_said_to_differ(arms):
     for _ in range(100):
         offsets = 0.3 * rng.standard_normal((arms, 6))
         found = summary_of([made_row(f's{i}', row) for i, row in enumerate(offsets.tolist())])
-        named += any(one['differs'] for one in found['joints'])
+        named += any(joint['differs'] for joint in found['joints'])
     assert named <= 6
 
 

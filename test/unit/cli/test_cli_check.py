@@ -21,9 +21,9 @@ from remaster_ros.session.records.reader import write_session
 from remaster_ros.types import Session
 
 
-def write(folder: Path, one: Measured) -> Path:
+def write(folder: Path, check: Measured) -> Path:
     """Write a check as a session."""
-    m = measured_rows(one.q, one.position)
+    m = measured_rows(check.q, check.position)
     markers = {'sir': np.array([0.1, 0.0, 0.02])}
     write_session(
         folder, Session(robot('iiwa7'), 'base_link', 'tool', markers, {'mocap': 'sir'}, m)
@@ -55,7 +55,7 @@ def test_day_by_day_until_a_joint_has_changed(run, arm, tmp_path):
         assert found['format'] == 'remaster-check/1'
         assert found['verdict'] == 'unchanged', found
         assert found['checks'] == day + 1
-    assert [one['detectable_mm'] is None for one in found['joints']] == [True, *[False] * 6]
+    assert [joint['detectable_mm'] is None for joint in found['joints']] == [True, *[False] * 6]
     changed = arm.joint(3, 5e-4)
     for day in range(12, 16):
         found = run(write(tmp_path / f'day{day}', arm.check(changed)))
@@ -103,8 +103,8 @@ def test_no_check_that_shows_a_change_says_that_none_has_changed(run, arm, tmp_p
     changed = arm.joint(3, 8e-4)
     for day in range(6):
         page = tmp_path / 'check.html'
-        one = arm.check(changed) if day > 1 else arm.check()
-        found = run(write(tmp_path / f'day{day}', one), '--out', str(page))
+        check = arm.check(changed) if day > 1 else arm.check()
+        found = run(write(tmp_path / f'day{day}', check), '--out', str(page))
         beyond = [
             row['joint']
             for row in found['joints']

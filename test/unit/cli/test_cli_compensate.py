@@ -81,8 +81,8 @@ def test_a_table_is_corrected_and_comes_back(file, tmp_path, unit, separator, de
 
 def test_without_times_there_is_no_added_speed(file, tmp_path):
     given = table(tmp_path / 'program.csv', wanted(3), time=False)
-    told = remaster('compensate', file, given, '--out', tmp_path / 'o.csv', '--json').stdout
-    assert set(json.loads(told)['added_speed_percent'].values()) == {None}
+    output = remaster('compensate', file, given, '--out', tmp_path / 'o.csv', '--json').stdout
+    assert set(json.loads(output)['added_speed_percent'].values()) == {None}
 
 
 def test_what_is_refused_is_one_line(file, tmp_path):

@@ -158,8 +158,8 @@ def test_the_other_session_is_shown_side_by_side():
         r'compliance_2 +\+0\.069 ± 0\.003 +\+0\.072 ± 0\.003 ′/\(N m\) +\+0\.7 σ', text
     )
     assert 'joint_2' in text
-    many = [compared(f'curve_2_at_{i}', 1e-4, 2e-4, 2.0) for i in range(30)]
-    text = summary(session, confirmation(0.93, 0.35e-3, many))
+    values = [compared(f'curve_2_at_{i}', 1e-4, 2e-4, 2.0) for i in range(30)]
+    text = summary(session, confirmation(0.93, 0.35e-3, values))
     assert (
         'Joint compliance of joints 2 and 4: 30 values, which differ by 2.0 standard deviations'
         in text

@@ -91,13 +91,13 @@ def as_xacro(folder: Path) -> tuple[Path, Path, str]:
         '[\'kinematics\']}"/><material name="grey">',
         1,
     )
-    path, own = folder / 'ur.urdf.xacro', folder / 'my_kinematics.yaml'
+    path, calibration = folder / 'ur.urdf.xacro', folder / 'my_kinematics.yaml'
     path.write_text(text, encoding='utf-8')
-    own.write_text(
+    calibration.write_text(
         yaml.safe_dump({'kinematics': {**kinematics, 'hash': 'calib_49578960957000'}}),
         encoding='utf-8',
     )
-    return path, own, read_description(path, {'kinematics_params': str(own)})
+    return path, calibration, read_description(path, {'kinematics_params': str(calibration)})
 
 
 RAIL = (
@@ -110,14 +110,14 @@ RAIL = (
 # All at once, and by themselves those whose angles have another order of turns behind them.
 @pytest.mark.parametrize('joint', [None, 1, 4])
 def test_a_ur_with_half_a_degree_at_each_joint(tmp_path, joint):
-    xacro, own, urdf = as_xacro(tmp_path)
+    xacro, calibration, urdf = as_xacro(tmp_path)
     offsets = np.zeros(6)
     offsets[slice(None) if joint is None else joint] = HALF_DEGREE
     file = save(tmp_path, arm(urdf, tip='tool0', joint_offsets=offsets), urdf)
     out = tmp_path / 'out'
-    export(file, 'ur', out, '--base', own)
-    new = out / own.name
-    written, before = (yaml.safe_load(p.read_text())['kinematics'] for p in (new, own))
+    export(file, 'ur', out, '--base', calibration)
+    new = out / calibration.name
+    written, before = (yaml.safe_load(p.read_text())['kinematics'] for p in (new, calibration))
     assert written['hash'] == before['hash']
     changed = {link for link in LINKS if written[link] != before[link]}
     assert changed == set(LINKS if joint is None else [LINKS[joint]])
@@ -132,15 +132,15 @@ def test_a_ur_with_half_a_degree_at_each_joint(tmp_path, joint):
 @pytest.mark.parametrize('rail_m', [0.0, 2e-3])
 def test_a_ur_on_a_rail(tmp_path, rail_m):
     """Its own file has no place for the rail's zero, which is left out and said."""
-    xacro, own, urdf = as_xacro(tmp_path)
+    xacro, calibration, urdf = as_xacro(tmp_path)
     carried = urdf.replace('</robot>', RAIL)
     q = np.column_stack((np.linspace(-0.5, 0.5, 40), configurations()))
     offsets = np.array([rail_m, *(6 * [HALF_DEGREE])])
     model = arm(carried, base='hall', tip='tool0', joint_offsets=offsets)
     out = tmp_path / 'out'
-    export(save(tmp_path, model, carried), 'ur', out, '--base', own)
-    told = {'kinematics_params': str(out / own.name)}
-    made = read_description(xacro, told).replace('</robot>', RAIL)
+    export(save(tmp_path, model, carried), 'ur', out, '--base', calibration)
+    arguments = {'kinematics_params': str(out / calibration.name)}
+    made = read_description(xacro, arguments).replace('</robot>', RAIL)
     names = ['rail', *NAMES]
     same(
         reached(made, q, names, base='hall'),
@@ -163,17 +163,17 @@ def test_the_makers_description_of_a_ur(tmp_path):
 
 
 def makers_description(tmp_path: Path, share: Path, ur_type: str = 'ur5e') -> None:
-    xacro, own = share / 'urdf/ur.urdf.xacro', tmp_path / 'own.yaml'
-    own.write_text((share / f'config/{ur_type}/default_kinematics.yaml').read_text())
+    xacro, calibration = share / 'urdf/ur.urdf.xacro', tmp_path / 'own.yaml'
+    calibration.write_text((share / f'config/{ur_type}/default_kinematics.yaml').read_text())
 
     def urdf(kinematics):
-        told = {'ur_type': ur_type, 'name': 'ur', 'kinematics_params': str(kinematics)}
-        return read_description(xacro, told, [share], trusted=True)
+        arguments = {'ur_type': ur_type, 'name': 'ur', 'kinematics_params': str(kinematics)}
+        return read_description(xacro, arguments, [share], trusted=True)
 
     offsets = np.full(6, HALF_DEGREE)
-    text = urdf(own)
+    text = urdf(calibration)
     file = save(tmp_path, arm(text, tip='tool0', joint_offsets=offsets), text)
-    out = export(file, 'ur', tmp_path / 'out', '--base', own)
+    out = export(file, 'ur', tmp_path / 'out', '--base', calibration)
     q = configurations()
     same(reached(urdf(out / 'own.yaml'), q), reached(text, q + offsets))
 
@@ -182,13 +182,13 @@ def makers_description(tmp_path: Path, share: Path, ur_type: str = 'ur5e') -> No
 def erring(tmp_path_factory):
     """Return the folder, arm and URDF of a UR with offsets, lengths and tilts."""
     folder = tmp_path_factory.mktemp('erring')
-    xacro, own, urdf = as_xacro(folder)
+    xacro, calibration, urdf = as_xacro(folder)
     rng = np.random.default_rng(5)
     geometry = Geometry(3e-4 * rng.standard_normal((7, 3)), 5e-4 * rng.standard_normal((7, 3)))
     geometry.shifts[6] = geometry.turns[6] = 0.0
     offsets = np.radians(0.3) * rng.standard_normal(6)
     model = arm(urdf, tip='tool0', joint_offsets=offsets, geometry=geometry)
-    return save(folder, model, urdf), model, urdf, xacro, own
+    return save(folder, model, urdf), model, urdf, xacro, calibration
 
 
 def export(file, form, out, *more):
@@ -198,14 +198,16 @@ def export(file, form, out, *more):
 
 @pytest.mark.parametrize('form', ['urdf', 'ur', 'json', 'csv'])
 def test_lengths_and_tilts_too(erring, tmp_path, form):
-    file, model, _, xacro, own = erring
+    file, model, _, xacro, calibration = erring
     q = configurations()
-    out = export(file, form, tmp_path / 'o', *(['--base', own] if form == 'ur' else []))
+    out = export(file, form, tmp_path / 'o', *(['--base', calibration] if form == 'ur' else []))
     wanted = model.state(q).tool
     if form == 'urdf':
         same(reached((out / 'robot_calibrated.urdf').read_text(), q), wanted)
     elif form == 'ur':
-        made = read_description(xacro, {'kinematics_params': str(out / own.name)}, trusted=True)
+        made = read_description(
+            xacro, {'kinematics_params': str(out / calibration.name)}, trusted=True
+        )
         same(reached(made, q), wanted)
     else:
         if form == 'json':
@@ -415,8 +417,8 @@ def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path):
     )
     file = save(tmp_path, model, UR.urdf)
     out = tmp_path / 'o'
-    told = remaster('export', file, '--to', 'rising', '--out', out, '--json').stdout
-    left = json.loads(told)['left_out']
+    output = remaster('export', file, '--to', 'rising', '--out', out, '--json').stdout
+    left_out = json.loads(output)['left_out']
     root = ElementTree.fromstring((out / 'robot.urdf').read_text())
     rising = np.array(
         [float(root.find(f"joint[@name='{n}']/calibration").get('rising')) for n in NAMES]
@@ -427,10 +429,12 @@ def test_what_is_left_out_is_stated_and_no_offset_without_its_cause(tmp_path):
         error = marker(reached(UR.urdf, q[:300] + offsets)) - marker(model.state(q[:300]).tool)
         return 1e3 * rms_refitted(error, model, q[:300])
 
-    assert left['rms_mm'] == pytest.approx(remains(rising), rel=0.1)
-    assert 0.1 < left['rms_mm'] < 0.9 * remains(model.joint_offsets)
-    assert [part['what'] for part in left['parts']] == ['joint compliance of shoulder_lift_joint']
-    assert left['parts'][0]['rms_mm'] > left['rms_mm']
+    assert left_out['rms_mm'] == pytest.approx(remains(rising), rel=0.1)
+    assert 0.1 < left_out['rms_mm'] < 0.9 * remains(model.joint_offsets)
+    assert [part['what'] for part in left_out['parts']] == [
+        'joint compliance of shoulder_lift_joint'
+    ]
+    assert left_out['parts'][0]['rms_mm'] > left_out['rms_mm']
 
 
 def marker(places):
@@ -444,13 +448,13 @@ def rms_refitted(error, model, q):
     columns[:, :, 3:6] = np.cross(np.eye(3), marker(tool)[:, None, :]).swapaxes(1, 2)
     columns[:, :, 6:] = tool[:, :3, :3]
     columns = columns.reshape(-1, 9)
-    left = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
-    return np.sqrt(np.mean(np.sum(left.reshape(-1, 3) ** 2, axis=1)))
+    remainder = error.ravel() - columns @ np.linalg.lstsq(columns, error.ravel(), rcond=None)[0]
+    return np.sqrt(np.mean(np.sum(remainder.reshape(-1, 3) ** 2, axis=1)))
 
 
 def test_what_is_refused_is_one_line(tmp_path, erring):
     file, _ = only_offsets(tmp_path)
-    own = erring[4]
+    calibration = erring[4]
 
     def refused(*args):
         out = tmp_path / 'refused'
@@ -460,10 +464,12 @@ def test_what_is_refused_is_one_line(tmp_path, erring):
 
     assert '--base' in refused('--to', 'ur')
     # Of another arm: its own calibration is not in the description.
-    assert 'kinematics.shoulder is not that of the robot' in refused('--to', 'ur', '--base', own)
+    assert 'kinematics.shoulder is not that of the robot' in refused(
+        '--to', 'ur', '--base', calibration
+    )
     assert "no key 'kinematics'" in refused('--to', 'ur', '--base', file)
     assert '<transmission>' in refused('--to', 'ros2_control')
-    assert 'leave it out' in refused('--to', 'csv', '--base', own)
+    assert 'leave it out' in refused('--to', 'csv', '--base', calibration)
     assert 'DIRECTION' in refused('--to', 'pad', '--motor', 'elbow_joint=1,2')
     assert "'A9' is not among" in refused('--to', 'pad', '--motor', 'A9=1,2,1')
     broken = tmp_path / 'broken.urdf'

@@ -50,7 +50,7 @@ def written(folder, description: Description, name='robot.urdf'):
 
 
 @pytest.mark.parametrize(
-    ('robot', 'held'),
+    ('robot', 'held_joint'),
     [
         pytest.param('ur5e', '', marks=pytest.mark.qualify),
         ('irb120', ''),
@@ -59,16 +59,16 @@ def written(folder, description: Description, name='robot.urdf'):
         pytest.param('xarm7', 'joint5', marks=pytest.mark.qualify),
     ],
 )
-def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_path):
+def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held_joint, do, tmp_path):
     """Two commands: a cell file, and the page of its plan. The UR is a xacro file."""
     description = {**ROBOTS, 'xarm7': xarm7}[robot]()
     is_xacro = robot == 'ur5e'
     path = (macro if is_xacro else written)(tmp_path, description)
     arguments = ['name:=mine'] if is_xacro else []
     found = json.loads(do(path, *arguments, '--json').stdout)
-    assert (found['held_joint'] or '') == held
+    assert (found['held_joint'] or '') == held_joint
     cell = read_cell(tmp_path / 'cell.yaml')
-    assert cell.held_joint == held
+    assert cell.held_joint == held_joint
     assert (cell.robot.base_link, cell.robot.tip_link) == (found['base_link'], found['tip_link'])
     plan = found['plan']
     print(robot, plan)
@@ -81,8 +81,8 @@ def test_known_arms_go_to_a_finished_plan_without_an_edit(robot, held, do, tmp_p
     poses = 40 if robot == 'panda' else 8
     few = ('--poses', poses, '--validation', 3, '--reference-every', 0, '--seed', 1)
     page = tmp_path / 'plan.html'
-    told = remaster('plan', tmp_path / 'cell.yaml', *few, '--json', '--out', page).stdout
-    plan = json.loads(told)
+    output = remaster('plan', tmp_path / 'cell.yaml', *few, '--json', '--out', page).stdout
+    plan = json.loads(output)
     html = page.read_text(encoding='utf-8')
     assert f'{plan["configurations"]} configurations at {plan["poses"]} poses in ' in html
     assert plan['robot_time_s'] > 10.0
@@ -158,17 +158,17 @@ def test_a_package_that_is_elsewhere_is_asked_for_and_found(do, tmp_path, monkey
     path = macro(tmp_path, ROBOTS['irb120']())
     elsewhere = tmp_path / 'elsewhere'
     (tmp_path / 'src' / 'clone_of_it').rename(elsewhere)
-    apart = tmp_path / 'apart' / 'robot.urdf.xacro'
-    apart.parent.mkdir()
-    (elsewhere / 'urdf' / path.name).rename(apart)
+    moved_file = tmp_path / 'apart' / 'robot.urdf.xacro'
+    moved_file.parent.mkdir()
+    (elsewhere / 'urdf' / path.name).rename(moved_file)
     (elsewhere / 'package.xml').rename(elsewhere / 'package.xml.off')
-    error = do(apart, 'name:=mine', status=2).stderr
+    error = do(moved_file, 'name:=mine', status=2).stderr
     assert 'it needs the ROS package my_arm' in error
     assert '--package-path' in error
     (elsewhere / 'package.xml.off').rename(elsewhere / 'package.xml')
     # Given relative to where the command is run, not to the xacro file.
     monkeypatch.chdir(tmp_path)
-    do(apart, 'name:=mine', '--package-path', 'elsewhere', '--no-plan')
+    do(moved_file, 'name:=mine', '--package-path', 'elsewhere', '--no-plan')
 
 
 def test_meshes_are_found_or_named(do, tmp_path):
@@ -230,8 +230,8 @@ def test_an_arm_that_lies_on_the_floor_at_zero_is_planned_from_elsewhere(do, tmp
     assert model.reasons(np.zeros((1, 6)))[0] == 'hits the floor'
     assert model.reasons(free_start(model, 0)[None])[0] == ''
     few = ('--poses', 4, '--validation', 0, '--reference-every', 0, '--json')
-    told = remaster('plan', tmp_path / 'cell.yaml', *few).stdout
-    assert json.loads(told)['configurations'] > 0
+    output = remaster('plan', tmp_path / 'cell.yaml', *few).stdout
+    assert json.loads(output)['configurations'] > 0
 
 
 @pytest.mark.parametrize('options', [(), ('--no-plan',)])

@@ -57,13 +57,15 @@ def test_the_object_says_what_is_planned():
 
 
 def test_an_optimal_design_is_as_precise_in_less_time(tmp_path):
-    whole = as_json('demo', *FEW)
+    full_plan = as_json('demo', *FEW)
     path = cell_with(tmp_path, '  design: optimal\n  solutions: chosen\n  order: fastest\n')
     optimal = as_json(path, *FEW)
     assert optimal['goal']['reached']
-    assert optimal['expected_rms_std_deg'] <= max(whole['expected_rms_std_deg'], 0.005) * 1.0001
-    assert optimal['configurations'] < whole['configurations']
-    assert optimal['robot_time_s'] < whole['robot_time_s']
+    assert (
+        optimal['expected_rms_std_deg'] <= max(full_plan['expected_rms_std_deg'], 0.005) * 1.0001
+    )
+    assert optimal['configurations'] < full_plan['configurations']
+    assert optimal['robot_time_s'] < full_plan['robot_time_s']
     assert optimal['dropped']['not needed by the design'] > 0
 
 

@@ -52,12 +52,12 @@ def test_a_recorded_session_with_the_layer_on(tmp_path, file, state):
     found = verified(session_of(replace(CASE, state=state)), tmp_path / 's', file)
     assert found['format'] == 'remaster-verify/1'
     assert found['verdict'] == found['toggle']['verdict'] == state
-    assert [one['joint'] for one in found['joints']] == list(
+    assert [joint['joint'] for joint in found['joints']] == list(
         read_compensation(file).compensator.joint_names
     )
     assert found['error_mm']['on'].keys() == {'mean_mm', 'interval95_mm'}
-    told = remaster('verify', tmp_path / 's', '--compensation', file).stdout
-    assert told.startswith(f'{state}: ')
+    output = remaster('verify', tmp_path / 's', '--compensation', file).stdout
+    assert output.startswith(f'{state}: ')
 
 
 def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_path, file):
@@ -66,10 +66,14 @@ def test_visits_for_the_same_joints_belong_together_whatever_their_numbers(tmp_p
     m, rng = session.measurements, np.random.default_rng(5)
     order = rng.permutation(len(m))
     off = rng.normal(0.0, 1e-5, m.wanted.shape)
-    apart, each = m.select(order), np.arange(len(m))
-    apart = replace(apart, observation=each, configuration=each, pose=each, stamp_s=1.0 * each)
-    apart = replace(apart, wanted=apart.wanted + off, q=apart.q + off)
-    found = verified(replace(session, measurements=apart), tmp_path / 's', file)
+    shuffled_rows, each = m.select(order), np.arange(len(m))
+    shuffled_rows = replace(
+        shuffled_rows, observation=each, configuration=each, pose=each, stamp_s=1.0 * each
+    )
+    shuffled_rows = replace(
+        shuffled_rows, wanted=shuffled_rows.wanted + off, q=shuffled_rows.q + off
+    )
+    found = verified(replace(session, measurements=shuffled_rows), tmp_path / 's', file)
     assert found['verdict'] == found['toggle']['verdict'] == 'in_use'
     assert found['text'] == WORDS['in_use']
 

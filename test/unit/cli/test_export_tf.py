@@ -42,11 +42,11 @@ def launched(folder):
 def published(folder):
     """(parent, child) -> pose, by the YAML as geometry_msgs/TransformStamped."""
     found = {}
-    for one in yaml.safe_load((folder / 'static_transforms.yaml').read_text())['transforms']:
-        assert one.keys() == {'header', 'child_frame_id', 'transform'}
-        place, turn = one['transform']['translation'], one['transform']['rotation']
+    for entry in yaml.safe_load((folder / 'static_transforms.yaml').read_text())['transforms']:
+        assert entry.keys() == {'header', 'child_frame_id', 'transform'}
+        place, turn = entry['transform']['translation'], entry['transform']['rotation']
         numbers = [*(place[axis] for axis in 'xyz'), *(turn[axis] for axis in 'xyzw')]
-        found[one['header']['frame_id'], one['child_frame_id']] = pose(numbers)
+        found[entry['header']['frame_id'], entry['child_frame_id']] = pose(numbers)
     return found
 
 
@@ -100,8 +100,8 @@ def test_the_transforms_lead_from_the_arm_to_what_was_measured(fitted, tmp_path)
     # at the lever of the distance, some 2 m.
     error = np.linalg.norm(points - m.position, axis=1)
     assert np.sqrt(np.mean(error**2)) < 1.5e-3
-    stated = {one['child']: one for one in json.loads(printed.stdout)['transforms']}
-    assert all(0.0 < std < 5e-3 for one in stated.values() for std in one['std_m'])
+    stated = {entry['child']: entry for entry in json.loads(printed.stdout)['transforms']}
+    assert all(0.0 < std < 5e-3 for entry in stated.values() for std in entry['std_m'])
 
 
 def test_a_frame_can_have_another_name(fitted, tmp_path):

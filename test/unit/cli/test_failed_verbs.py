@@ -88,18 +88,18 @@ def few_poses(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def full_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Let a given number of files be put in place; the next finds no space."""
-    left, replace = [-1], os.replace
+    room, replace = [-1], os.replace
 
     def counting(source: str, target: str) -> None:
-        if left[0] == 0:
+        if room[0] == 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
-        left[0] -= 1
+        room[0] -= 1
         replace(source, target)
 
     monkeypatch.setattr(os, 'replace', counting)
 
     def only(files: int) -> None:
-        left[0] = files
+        room[0] = files
 
     return only
 

@@ -49,11 +49,11 @@ def test_a_line_being_written_was_lost(killed, tail):
 @pytest.mark.parametrize('zeros', [0, 40])
 def test_observations_that_only_the_journal_has_come_back(killed, zeros):
     path = killed / 'observations.csv'
-    whole = path.read_bytes()
-    last = whole.rstrip(b'\n').rfind(b'\n') + 1
-    path.write_bytes(whole[: random.Random(2).randint(last + 1, len(whole) - 41)] + bytes(zeros))
+    data = path.read_bytes()
+    last = data.rstrip(b'\n').rfind(b'\n') + 1
+    path.write_bytes(data[: random.Random(2).randint(last + 1, len(data) - 41)] + bytes(zeros))
     remaster('recover', killed)
-    assert path.read_bytes() == whole
+    assert path.read_bytes() == data
 
 
 def test_what_is_no_session_or_damaged_or_in_use(killed, tmp_path):

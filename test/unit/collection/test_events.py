@@ -175,7 +175,7 @@ def test_every_kind_has_its_own_name():
 
 
 @pytest.mark.parametrize(
-    ('held', 'state', 'run', 'after'),
+    ('token', 'state', 'run', 'after'),
     [
         ('', 'running', 'a', 'a'),
         ('a', 'running', 'b', 'b'),
@@ -194,8 +194,8 @@ def test_every_kind_has_its_own_name():
         ('', 'idle', 'a', ''),
     ],
 )
-def test_the_token_lives_as_long_as_the_run(held, state, run, after):
-    assert PlannerState(state=state, run=run).run_held(held) == after
+def test_the_token_lives_as_long_as_the_run(token, state, run, after):
+    assert PlannerState(state=state, run=run).run_held(token) == after
 
 
 # Bags of older versions

@@ -62,8 +62,8 @@ def test_which_reflector_a_search_has_found_is_told_by_how_the_points_agree():
 
 def test_reflectors_that_cannot_be_told_apart_register_nothing():
     """On one circle about joint 1, which alone moves: either fits, with the tracker turned."""
-    T_R_T, beside = CHAIN.forward(PLACES[0]), rotation_vector_to_matrix(np.array([0.0, 0.0, 0.3]))
-    other = apply(inverse(T_R_T), beside @ apply(T_R_T, MARKERS['sir']))
+    T_R_T, turn = CHAIN.forward(PLACES[0]), rotation_vector_to_matrix(np.array([0.0, 0.0, 0.3]))
+    other = apply(inverse(T_R_T), turn @ apply(T_R_T, MARKERS['sir']))
     both = {'smr': MARKERS['sir'], 'smr_2': other}
     registration = FirstRegistration(CHAIN, both, ['tracker'], 0.025, {'tracker': tuple(both)})
 

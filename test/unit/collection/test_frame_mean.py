@@ -41,9 +41,9 @@ def test_a_damaged_frame_is_left_out_and_counted(by):
         assert isinstance(reading, PairedReading), reading
         assert reading.dropped == 3
         assert reading.samples == 57
-        rest = np.delete(good, bad, axis=0)
-        np.testing.assert_allclose(reading.position, rest.mean(axis=0), rtol=0, atol=1e-12)
-        np.testing.assert_allclose(reading.std, rest.std(axis=0, ddof=1), rtol=1e-9)
+        good_frames = np.delete(good, bad, axis=0)
+        np.testing.assert_allclose(reading.position, good_frames.mean(axis=0), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(reading.std, good_frames.std(axis=0, ddof=1), rtol=1e-9)
 
 
 def test_many_such_frames_are_a_reason_and_no_reading():

@@ -50,9 +50,12 @@ def test_the_order_of_arrival_does_not_matter():
         sorted_by_kind.add_reading('mocap', reading)
     for t in np.arange(-0.1, 1.0, 0.02):
         sorted_by_kind.add_joint_state(10.0 + t, Q)
-    one, other = mixed.decided['mocap'], sorted_by_kind.decided['mocap']
-    np.testing.assert_array_equal(one.position, other.position)
-    assert (one.samples, one.stamp_s) == (other.samples, other.stamp_s)
+    reading_mixed, reading_sorted = mixed.decided['mocap'], sorted_by_kind.decided['mocap']
+    np.testing.assert_array_equal(reading_mixed.position, reading_sorted.position)
+    assert (reading_mixed.samples, reading_mixed.stamp_s) == (
+        reading_sorted.samples,
+        reading_sorted.stamp_s,
+    )
 
 
 def test_a_marker_hidden_for_a_moment_prolongs_the_dwell():

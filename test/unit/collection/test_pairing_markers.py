@@ -34,9 +34,9 @@ def taken(pairing):
     """Return the samples of each marker of the bar."""
     first = pairing.decided['mocap']
     readings = [first, *pairing.further.get('mocap', [])]
-    assert all(isinstance(one, PairedReading) for one in readings), readings
-    assert len({(one.stamp_s, one.q.tobytes()) for one in readings}) == 1
-    return {one.marker: one.samples for one in readings}
+    assert all(isinstance(reading, PairedReading) for reading in readings), readings
+    assert len({(reading.stamp_s, reading.q.tobytes()) for reading in readings}) == 1
+    return {reading.marker: reading.samples for reading in readings}
 
 
 @pytest.mark.parametrize('order', [1, -1])

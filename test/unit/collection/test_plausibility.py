@@ -35,8 +35,8 @@ def scene(request):
         transforms.rotation_vector_to_matrix(rng.normal(0, 2e-3, 3)), rng.normal(0, 3e-3, 3)
     )
 
-    def measure(q, beside=0.0):
-        marker_R = CHAIN.positions(q, MARKER + beside, offsets)
+    def measure(q, offset=0.0):
+        marker_R = CHAIN.positions(q, MARKER + offset, offsets)
         return transforms.apply(transforms.inverse(T_R_N), marker_R) + rng.normal(0, 5e-5, 3)
 
     plausibility = Plausibility(CHAIN, {'sir': MARKER})
@@ -75,24 +75,24 @@ def test_another_marker_of_the_same_tool_is_found(scene):
     for q in poses(rng, 10):
         plausibility.judge(reading(q, measure(q)), T_R_N)
     for q in poses(rng, 20):
-        beside = np.array([0.0, 0.08, 0.0])
-        assert isinstance(plausibility.judge(reading(q, measure(q, beside)), T_R_N), Rejection)
+        offset = np.array([0.0, 0.08, 0.0])
+        assert isinstance(plausibility.judge(reading(q, measure(q, offset)), T_R_N), Rejection)
 
 
 def test_what_is_usual_narrows_what_is_allowed():
     """A robot that is off by 1 mm: 3 cm is another marker, though 5 would be allowed at first."""
     plausibility, T = Plausibility(CHAIN, {'sir': MARKER}), np.eye(4)
     rng = np.random.default_rng(0)
-    beside = np.array([0.03, 0.0, 0.0])
+    offset = np.array([0.03, 0.0, 0.0])
     for number, q in enumerate(poses(rng, 20)):
         place = CHAIN.positions(q, MARKER)
         good = reading(q, place + rng.normal(0, 5e-4, 3))
         assert plausibility.judge(good, T) is good
         if number > 6:
-            verdict = plausibility.judge(reading(q, place + beside), T)
+            verdict = plausibility.judge(reading(q, place + offset), T)
             assert '30 mm from where the robot has the marker (allowed 10 mm)' in verdict.detail
     # Another sensor has its own experience.
-    assert isinstance(plausibility.judge(reading(q, place + beside, 'tracker'), T), PairedReading)
+    assert isinstance(plausibility.judge(reading(q, place + offset, 'tracker'), T), PairedReading)
 
 
 def test_a_reading_that_repeats_the_last_one_though_the_arm_moved_is_frozen():
@@ -140,8 +140,8 @@ def test_a_reference_may_be_beside_its_place_but_not_frozen(scene):
         plausibility.judge(reading(q, measure(q)), T_R_N)
     usual = plausibility._allowed_m('mocap')
     first, second = poses(rng, 2)
-    away = transforms.apply(T_R_N, measure(first)) - CHAIN.positions(first, MARKER)
-    onward = T_R_N[:3, :3].T @ (away / np.linalg.norm(away))
+    error = transforms.apply(T_R_N, measure(first)) - CHAIN.positions(first, MARKER)
+    onward = T_R_N[:3, :3].T @ (error / np.linalg.norm(error))
     moved = reading(first, measure(first) + onward * usual)
     assert isinstance(plausibility.judge(moved, T_R_N), Rejection)
     assert plausibility.judge(moved, T_R_N, anywhere=True) is moved
@@ -178,8 +178,8 @@ def test_a_frame_whose_markers_were_exchanged_is_refused_as_a_whole(registered):
         plausibility = Plausibility(CHAIN, BODY)
         good = frame_of(q, true)
         assert plausibility.judge_frame(good, given) == good
-        for one, other in (('sir', 'b'), ('sir', 'c'), ('b', 'c')):
-            swapped = {**true, one: true[other], other: true[one]}
+        for marker, other in (('sir', 'b'), ('sir', 'c'), ('b', 'c')):
+            swapped = {**true, marker: true[other], other: true[marker]}
             (verdict,) = plausibility.judge_frame(frame_of(q, swapped), given)
             assert isinstance(verdict, Rejection)
             assert verdict.reason == 'swapped'
@@ -202,5 +202,5 @@ def test_every_marker_of_a_frame_has_a_last_reading_of_its_own():
     plausibility = Plausibility(CHAIN, BODY)
     readings = frame_of(first)
     assert plausibility.judge_frame(readings, T_R_N) == readings
-    again = [replace(one, q=second) for one in readings]
+    again = [replace(marker_reading, q=second) for marker_reading in readings]
     assert [item.reason for item in plausibility.judge_frame(again, None)] == ['frozen'] * 3

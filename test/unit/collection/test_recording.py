@@ -259,7 +259,7 @@ def test_what_was_recorded_before_is_not_read_again():
 def test_markers_of_a_frame_end_together_and_one_that_is_none_costs_no_other():
     """One good marker makes the configuration recorded; without any the sensor is refused."""
     rules = SensorRules('mocap', 'sir', min_samples=5, further=('b', 'c'))
-    for refused, left, result in (
+    for refused, count, result in (
         ('', 3, 'recorded'),
         ('b', 2, 'recorded'),
         ('mocap', 0, 'rejected'),
@@ -274,7 +274,7 @@ def test_markers_of_a_frame_end_together_and_one_that_is_none_costs_no_other():
             bench.recording.take_joints(bench.t, Q)
             ended.append(bench.recording.end({}))
         (end,) = [item for item in ended if item is not None]
-        assert (len(end.accepted), end.result) == (left, result)
+        assert (len(end.accepted), end.result) == (count, result)
         assert [item.reason for item in end.left_out] == ['swapped'] * (refused == 'b')
         assert len(end.rejected) == (refused == 'mocap')
 

@@ -35,17 +35,17 @@ def chain_of(urdf):
 
 
 @pytest.mark.parametrize(
-    ('way', 'told'),
+    ('way', 'detail'),
     [
         ([2e-4, 0.0, 0.0], 'a joint moved 0.200 mm (allowed 0.125)'),
         ([1e-4, 7e-4, 0.0], 'a joint moved 7.00e-04 rad (allowed 5.0e-04)'),
         ([1e-4, 4e-4, 0.0], ''),
     ],
 )
-def test_an_arm_that_slides_during_the_dwell(way, told):
+def test_an_arm_that_slides_during_the_dwell(way, detail):
     pairing = run(Pairing(10.0, Q, (STREAM,), units=UNITS), offset=np.array(way))
     found = pairing.decided['mocap']
-    assert (found.detail if isinstance(found, Rejection) else '') == told
+    assert (found.detail if isinstance(found, Rejection) else '') == detail
 
 
 def test_where_an_arm_that_slides_has_settled():
@@ -110,8 +110,8 @@ def test_references_of_an_arm_that_slides_are_told_apart_by_millimetres():
 def measured(tmp_path_factory):
     """Return an arm of which one joint slides, and a session of it."""
     folder = tmp_path_factory.mktemp('telescope')
-    held = {'held_joint': 'joint_3', 'held_values_m': [-0.05, 0.0, 0.05]}
-    cell = sliding_cell(folder, telescope(), **held)
+    options = {'held_joint': 'joint_3', 'held_values_m': [-0.05, 0.0, 0.05]}
+    cell = sliding_cell(folder, telescope(), **options)
     return cell, simulate(cell, poses=10, validation_poses=0, seed=1)
 
 
@@ -154,11 +154,11 @@ def test_the_fakes_begin_amid_the_way_of_a_slide_and_repeat_to_micrometres(measu
     chain, rng = world.chain, np.random.default_rng(0)
     assert world.start_q[2] == 0.0
     np.testing.assert_allclose(np.degrees(world.start_q[[0, 3]]), [5.0, 112.0])
-    many = np.array(
+    offsets = np.array(
         [make_world(tmp_path / 'w', cell, s, 10.0).truth.joint_offsets for s in range(40)]
     )
     expected = np.deg2rad(0.3) * chain.per_radian
-    np.testing.assert_allclose(np.sqrt(np.mean(many**2, axis=0)), expected, rtol=0.4)
+    np.testing.assert_allclose(np.sqrt(np.mean(offsets**2, axis=0)), expected, rtol=0.4)
     fake = FakeArm(world, rng)
     ends = []
     for _ in range(40):

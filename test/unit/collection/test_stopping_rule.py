@@ -70,8 +70,8 @@ def test_a_session_so_far_is_what_was_measured_by_then_held_out_or_not():
     # The two that are held out lie between the second and the third.
     assert part.measurements.configuration.max() == 4
     assert (elapsed_s, pace_s) == (40.0, 10.0)
-    whole, elapsed_s, _ = so_far(replace(session, timed=False), PLANNED - SOLUTIONS)
-    assert len(whole.measurements) == len(rows)
+    full_session, elapsed_s, _ = so_far(replace(session, timed=False), PLANNED - SOLUTIONS)
+    assert len(full_session.measurements) == len(rows)
     assert np.isnan(elapsed_s)
 
 
@@ -181,5 +181,5 @@ def test_intervals_at_the_end_hold_what_was_drawn():
         std = np.array(list(last.joint_std.values())[1:6], dtype=float)
         inside.append(np.abs(found.mode.z[1:6] - offsets[1:6]) < 1.96 * std)
     # A joint's error says something of another's: counted by session.
-    held = int(np.sum(np.sum(inside, axis=1) >= 4))
-    assert binomtest(held, 6, 0.95, alternative='less').pvalue > 1e-4
+    covered_count = int(np.sum(np.sum(inside, axis=1) >= 4))
+    assert binomtest(covered_count, 6, 0.95, alternative='less').pvalue > 1e-4

@@ -24,7 +24,10 @@ SENSORS = RequiredSensors(['mocap'], 'all')
 
 def plan_of(seed, poses, solutions):
     q = np.random.default_rng(seed).uniform(-1.5, 1.5, (poses, solutions, len(CHAIN)))
-    return Plan(tuple(PlannedPose(CHAIN.forward(own[0]), own) for own in q), {'unseen': 4})
+    return Plan(
+        tuple(PlannedPose(CHAIN.forward(solution_set[0]), solution_set) for solution_set in q),
+        {'unseen': 4},
+    )
 
 
 class Tours:
@@ -126,8 +129,8 @@ def bench(tmp_path):
         return made[-1]
 
     yield make
-    for one in made:
-        one.journal.close()
+    for rig in made:
+        rig.journal.close()
 
 
 def test_the_registration_comes_first_then_the_collection_to_its_end(bench):
@@ -214,8 +217,8 @@ def test_what_is_left_of_a_pose_is_reached_from_where_the_arm_stands(bench):
     b.end(stop, stop.ids[0], 'failed')
     elsewhere = Q + 0.3
     assert b.progress.rest(elsewhere) is None, 'it is planned'
-    rest = b.progress.rest(elsewhere)
-    assert (rest.pose, rest.ids) == (stop.pose, stop.ids[1:])
+    remaining_stop = b.progress.rest(elsewhere)
+    assert (remaining_stop.pose, remaining_stop.ids) == (stop.pose, stop.ids[1:])
     b.restart()
     assert b.progress.open_pose.ids == stop.ids[1:]
 

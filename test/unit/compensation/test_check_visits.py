@@ -57,8 +57,8 @@ def test_what_was_written_is_visited_in_its_order_and_expected_alike(planner, vi
 
 
 def test_a_slide_of_a_check_is_written_and_read_in_mm(tmp_path):
-    held = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [-0.3, 0.3]}
-    cell = read_cell(sliding_cell(tmp_path, rail(), **held))
+    options = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [-0.3, 0.3]}
+    cell = read_cell(sliding_cell(tmp_path, rail(), **options))
     chain = cell.chain()
     scene = cell.planning_scene(chain)
     poses = scene.plan(60, scene.rough_R, np.random.default_rng(2)).poses

@@ -77,10 +77,14 @@ def test_a_changed_joint_is_found_and_named(name):
         assert not found.tool_moved or joint == arm.true.joints - 1
         assert abs(found.since - BEFORE) <= 1
         if found.changed == (joint,):
-            others = [one for i, one in enumerate(found.joints) if i not in (0, joint)]
-            assert all(abs(one.change) < 4.5 * one.std for one in others)
-        one = found.joints[joint]
-        assert one.change * one.lever_m == pytest.approx(2e-4, abs=4 * one.std * one.lever_m)
+            unchanged_joints = [
+                result for i, result in enumerate(found.joints) if i not in (0, joint)
+            ]
+            assert all(abs(result.change) < 4.5 * result.std for result in unchanged_joints)
+        changed_joint = found.joints[joint]
+        assert changed_joint.change * changed_joint.lever_m == pytest.approx(
+            2e-4, abs=4 * changed_joint.std * changed_joint.lever_m
+        )
 
 
 def test_a_marker_that_was_moved_is_no_joint():
@@ -140,8 +144,8 @@ def test_nothing_is_found_where_nothing_is(arms):
     seed = 10
     print('seed', seed)
     alarms = again = 0
-    for one in range(arms):
-        arm = CheckedArm(1000 * seed + one)
+    for number in range(arms):
+        arm = CheckedArm(1000 * seed + number)
         days = arm.days(12)
         found = [judge(arm.found, days[:count]) for count in (1, 2, 3, 4, 6, 9, 12)]
         alarms += any(each.verdict in ('changed', 'setup_moved') for each in found)
@@ -153,12 +157,12 @@ def test_nothing_is_found_where_nothing_is(arms):
 
 def test_several_readings_of_a_pose_are_one():
     arm = CheckedArm(11)
-    one, two = arm.check(), arm.check()
-    both = type(one)(
-        np.concatenate((one.q, two.q)),
-        one.sensor + two.sensor,
-        one.marker + two.marker,
-        np.concatenate((one.position, two.position)),
+    first_check, second_check = arm.check(), arm.check()
+    both = type(first_check)(
+        np.concatenate((first_check.q, second_check.q)),
+        first_check.sensor + second_check.sensor,
+        first_check.marker + second_check.marker,
+        np.concatenate((first_check.position, second_check.position)),
     ).merged(arm.found.chain)
-    np.testing.assert_allclose(both.position, 0.5 * (one.position + two.position))
-    assert both.sensor == one.sensor
+    np.testing.assert_allclose(both.position, 0.5 * (first_check.position + second_check.position))
+    assert both.sensor == first_check.sensor

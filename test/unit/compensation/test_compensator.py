@@ -83,11 +83,11 @@ def test_each_candidate_moves_the_arm_as_its_effect_defines(context):
     nothing = arm('iiwa7', chain=chain, joint_offsets=context.joint_offsets)
     first = m.temperature_c[np.argmin(m.stamp_s)]
     nothing = replace(nothing, reference_c=first, mean_c=first)
-    corrected, left = set(), set()
+    corrected, leftovers = set(), set()
     for candidate in the_candidates(context):
         slots = list(slots_of(candidate, chain))
         if not slots:
-            left.add((candidate.name, candidate.place, candidate.driver.partition('_of_')[0]))
+            leftovers.add((candidate.name, candidate.place, candidate.driver.partition('_of_')[0]))
             continue
         corrected.add(candidate.name)
         design = candidate.columns(context)
@@ -99,8 +99,8 @@ def test_each_candidate_moves_the_arm_as_its_effect_defines(context):
                 value = size * matrix[:, parameter]
                 model = with_slot(model, slot, value)
             points = [
-                apply(one.state(m.q, m.temperature_c).tool, context.markers[context.marker])
-                for one in (model, nothing)
+                apply(variant.state(m.q, m.temperature_c).tool, context.markers[context.marker])
+                for variant in (model, nothing)
             ]
             moved = points[0] - points[1]
             if candidate.happened:
@@ -118,10 +118,17 @@ def test_each_candidate_moves_the_arm_as_its_effect_defines(context):
         *('thermal_growth', 'base_compliance', 'lateral_compliance', 'step', 'unnamed'),
     } == corrected
     # What remains depends on what no controller is told, is at the marker, or is to be mended.
-    others = {(name, driver) for name, place, driver in left if place != 'marker'}
-    assert others - {('base_tipping', 'gravity_moment'), ('thermal_growth', 'temperature')} <= {
-        (name, driver) for name, driver in others if driver in ('approach', 'last_move', 'time')
-    }, left
+    uncorrected_effects = {
+        (name, driver) for name, place, driver in leftovers if place != 'marker'
+    }
+    assert uncorrected_effects - {
+        ('base_tipping', 'gravity_moment'),
+        ('thermal_growth', 'temperature'),
+    } <= {
+        (name, driver)
+        for name, driver in uncorrected_effects
+        if driver in ('approach', 'last_move', 'time')
+    }, leftovers
 
 
 def with_slot(model, slot, value):
@@ -143,9 +150,9 @@ def with_slot(model, slot, value):
 
 
 def one_at(slot):
-    one = np.zeros(7)
-    one[slot.joint] = 1.0
-    return one
+    unit = np.zeros(7)
+    unit[slot.joint] = 1.0
+    return unit
 
 
 @pytest.mark.parametrize('name', ['six', 'lwr4plus', *SLIDING])
@@ -175,7 +182,7 @@ def pose_errors(model: ArmModel, q: np.ndarray, command: np.ndarray) -> np.ndarr
     turn = reached[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - wanted[:, :3, 3]
     both = (shift, matrix_to_rotation_vector(turn))
-    return np.stack([np.linalg.norm(one, axis=1) for one in both], axis=1)
+    return np.stack([np.linalg.norm(errors, axis=1) for errors in both], axis=1)
 
 
 @pytest.mark.parametrize('name', ['six', 'lwr4plus', 'iiwa14', *SLIDING])
@@ -191,19 +198,19 @@ def test_the_tool_is_where_the_nominal_robot_has_it(name):
     assert np.array_equal(found.incomplete, off.max(axis=1) > REACHED)
     # By a fade of singular directions 0.96 of an LWR's were left.
     assert found.incomplete.mean() < 0.2
-    rms = [np.sqrt(np.mean(one[:, 0] ** 2)) for one in (off, before)]
+    rms = [np.sqrt(np.mean(pose_error[:, 0] ** 2)) for pose_error in (off, before)]
     assert rms[0] < 0.1e-3 < 0.03 * rms[1]
-    own = np.abs(compensator.angle_errors(q) / unit)
+    errors = np.abs(compensator.angle_errors(q) / unit)
     most = np.abs((found.command - q) / unit).max(axis=1)
-    assert np.all(most <= np.maximum(BUDGET_RAD, own.max(axis=1)) + 1e-9)
-    whole = ~found.incomplete
+    assert np.all(most <= np.maximum(BUDGET_RAD, errors.max(axis=1)) + 1e-9)
+    is_complete = ~found.incomplete
     # But for poses out of reach: an arm is not stretched further by more motion.
-    assert np.mean(most[~whole] > 0.99 * BUDGET_RAD) > 0.5
+    assert np.mean(most[~is_complete] > 0.99 * BUDGET_RAD) > 0.5
     back = compensator.true(found.command)
-    np.testing.assert_allclose(back[whole], q[whole], rtol=0, atol=5e-5)
+    np.testing.assert_allclose(back[is_complete], q[is_complete], rtol=0, atol=5e-5)
     # The way back of what is not reached: the nominal robot where the tool then is.
-    told = model.chain.forward(back) @ np.linalg.inv(model.state(found.command).tool)
-    assert np.mean(np.abs(told - np.eye(4)).max(axis=(1, 2)) < REACHED) > 0.8
+    difference = model.chain.forward(back) @ np.linalg.inv(model.state(found.command).tool)
+    assert np.mean(np.abs(difference - np.eye(4)).max(axis=(1, 2)) < REACHED) > 0.8
 
 
 @pytest.mark.parametrize('budget_deg', [2.0, 0.5])
@@ -213,8 +220,8 @@ def test_on_the_bound_there_is_no_better_pose(budget_deg):
     compensator = Compensator(model, np.radians(budget_deg))
     q = configurations(model, 300, 5)
     found = compensator.correct(q)
-    own = compensator.angle_errors(q)
-    bound = np.maximum(np.radians(budget_deg), np.abs(own))
+    errors = compensator.angle_errors(q)
+    bound = np.maximum(np.radians(budget_deg), np.abs(errors))
     frames = model.chain.frames(model.sampled_angles())
     lever = np.linalg.norm(
         model.chain.velocities(frames, (frames[:, -1] @ model.chain.T_fixed[-1])[:, :3, 3]), axis=1
@@ -307,12 +314,12 @@ def test_a_quarter_of_an_arm_is_commanded_as_the_whole_one(name):
         geometry=Geometry(0.25 * slight.shifts, slight.turns),
     )
     q = configurations(model, 200, 5)
-    whole = Compensator(replace(model, geometry=slight)).correct(q)
+    full_correction = Compensator(replace(model, geometry=slight)).correct(q)
     part = Compensator(small).correct(q)
-    np.testing.assert_allclose(part.command, whole.command, atol=1e-9)
-    np.testing.assert_allclose(part.residual_m, 0.25 * whole.residual_m, atol=1e-9)
+    np.testing.assert_allclose(part.command, full_correction.command, atol=1e-9)
+    np.testing.assert_allclose(part.residual_m, 0.25 * full_correction.residual_m, atol=1e-9)
     # Most directions are those of a tool that goes where it is wanted.
-    assert np.median(whole.residual_m) < 1e-5
+    assert np.median(full_correction.residual_m) < 1e-5
 
 
 @pytest.mark.parametrize(('name', 'wrist'), [('six', 4), ('lwr4plus', 5)])

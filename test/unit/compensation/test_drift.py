@@ -48,7 +48,7 @@ def test_evidence_of_a_drift_exceeds_100_in_one_of_100_at_most():
     """300 series of 60, looked at every third day: more than 9 have p < 0.001."""
     x = np.random.default_rng(4).standard_normal((300, 60))
     days = np.arange(60.0)
-    ever = [max(drift(one[:T], days[:T]).evidence for T in range(3, 61, 3)) for one in x]
+    ever = [max(drift(series[:T], days[:T]).evidence for T in range(3, 61, 3)) for series in x]
     assert np.sum(np.array(ever) >= 100.0) <= 9
 
 
@@ -76,9 +76,9 @@ def test_a_drift_is_told_before_it_matters_and_named_when_it_does():
     per_day_m = 6.0 * NOISE_M * arm.sizes[JOINT] / POWER_STD / 60.0
     checks = drifting(arm, BEFORE + 60, per_day_m)
     early = next(
-        one
+        content
         for count in range(BEFORE + 6, BEFORE + 50, 2)
-        if (one := said(arm, checks[:count]))['trend'] is not None
+        if (content := said(arm, checks[:count]))['trend'] is not None
     )
     print(early['text'])
     assert early['trend']['kind'] == 'drift'
@@ -100,7 +100,7 @@ def test_a_drift_is_told_before_it_matters_and_named_when_it_does():
 
 def test_without_times_a_drift_is_in_checks():
     arm = CheckedArm(32)
-    checks = [replace(one, when_s=np.nan) for one in drifting(arm, BEFORE + 40, 4e-6)]
+    checks = [replace(check, when_s=np.nan) for check in drifting(arm, BEFORE + 40, 4e-6)]
     found = said(arm, checks)
     assert found['next_check'] is None
     assert found['next_in_checks'] >= 1

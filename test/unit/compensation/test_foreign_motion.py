@@ -44,7 +44,7 @@ def standing(q):
 
 def points(passed: SentTrajectory):
     found = passed.admitted.waypoints
-    return [np.array(one) for one in zip(*((w.time_s, w.q, w.velocity) for w in found))]
+    return [np.array(values) for values in zip(*((w.time_s, w.q, w.velocity) for w in found))]
 
 
 @pytest.mark.parametrize('name', ['six', 'lwr4plus'])
@@ -57,7 +57,7 @@ def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_p
     chain = compensator.model.chain
     gate = gate_of(correction)
     rng = np.random.default_rng(100 + seed)
-    crossed, slowest, cpu_s, sent_points, left = 0, 1.0, 0.0, 0, []
+    crossed, slowest, cpu_s, sent_points, distances = 0, 1.0, 0.0, 0, []
     for _ in range(16):
         middle = configurations(compensator.model, 1, int(rng.integers(1 << 30)))[0]
         middle[4 if name == 'six' else 3] = 0.0
@@ -99,17 +99,17 @@ def test_paths_through_singularities_keep_the_limits_and_the_tool_its_path(tmp_p
         path = drawn(*_parts(wanted), faster)
         nominal = chain.forward(path)[:, :3, 3]
         off, before = (
-            np.linalg.norm(compensator.tool(one)[:, :3, 3] - nominal, axis=1)
-            for one in (sent, path)
+            np.linalg.norm(compensator.tool(angles)[:, :3, 3] - nominal, axis=1)
+            for angles in (sent, path)
         )
-        left.append(off)
+        distances.append(off)
         assert off.max() < before.max()
         slowest, sent_points = max(slowest, t[-1] / wanted.times_s[-1]), sent_points + len(t)
     assert crossed > 3
     # A correction of fractions of a degree does not make an arm much slower.
     assert 1.0 < slowest < 1.1
     # Where the accelerations are the planner's to the last, as much as they leave.
-    assert np.median(np.concatenate(left)) < 0.1e-3
+    assert np.median(np.concatenate(distances)) < 0.1e-3
     print(
         f'{name}: {crossed} paths, {slowest:.3f} times as long at most; '
         f'{1e3 * cpu_s / crossed:.1f} ms for {sent_points / crossed:.0f} points'
@@ -126,14 +126,14 @@ def test_what_is_planned_from_the_angles_it_was_told_begins_where_the_arm_is(tmp
     chain, gate = compensator.model.chain, gate_of(correction)
     at, target = configurations(compensator.model, 2, 6) * 0.5
     arm = standing(at)
-    told = TrueAngles(compensator).at(at, None, 0.0)
-    np.testing.assert_allclose(compensator.command(told), at, atol=1e-9)
-    wanted = line(told, target, ACCELERATION, chain)
+    start = TrueAngles(compensator).at(at, None, 0.0)
+    np.testing.assert_allclose(compensator.command(start), at, atol=1e-9)
+    wanted = line(start, target, ACCELERATION, chain)
     t, q, v = points(corrected_for_controller(wanted, arm, gate, correction, TOLERANCE_M))
     assert t[0] == 0.0
     np.testing.assert_allclose(q[[0, -1]], [at, compensator.command(target)], atol=1e-9)
     # Without its start, as many programs send: the same path, begun by the controller itself.
-    later = Trajectory(*(one[1:] for one in _parts(wanted)))
+    later = Trajectory(*(part[1:] for part in _parts(wanted)))
     t, q, v = points(corrected_for_controller(later, arm, gate, correction, TOLERANCE_M))
     assert t[0] > 0.0
     np.testing.assert_allclose(q[-1], compensator.command(target), atol=1e-9)
@@ -225,17 +225,17 @@ def test_what_is_refused_is_one_line(tmp_path):
     compensator = correction.compensator
     chain, gate = compensator.model.chain, gate_of(correction)
     at, target = configurations(compensator.model, 2, 12) * 0.5
-    arm, told = standing(at), compensator.true(at)
+    arm, start = standing(at), compensator.true(at)
 
     def refused(words, wanted, on=correction, by=gate):
         with pytest.raises(InputError, match=words) as caught:
             corrected_for_controller(wanted, arm, by, on, TOLERANCE_M)
         assert '\n' not in str(caught.value)
 
-    good = line(told, target, ACCELERATION, chain)
+    good = line(start, target, ACCELERATION, chain)
     t, q, v = _parts(good)
     for what in range(3):
-        broken = [one.copy() for one in _parts(good)]
+        broken = [part.copy() for part in _parts(good)]
         broken[what].flat[-1] = np.nan
         refused('not finite', Trajectory(*broken))
     refused('do not ascend', Trajectory(t[::-1], q, v))
@@ -247,12 +247,12 @@ def test_what_is_refused_is_one_line(tmp_path):
     share = float(np.max(np.abs(v).max(axis=0) / chain.velocity_limits)) / 1.2
     refused('is to turn at .* its limit', Trajectory(t * share, q, v / share))
     # Beyond the speeds of the arm between its points alone.
-    way = np.array([told, told + 0.99 * 0.1 * chain.velocity_limits])
+    way = np.array([start, start + 0.99 * 0.1 * chain.velocity_limits])
     refused('is to turn at', Trajectory(np.array([0.0, 0.1]), way, np.zeros((2, 6))))
     beyond = chain.upper - 0.001
-    refused('would go to', line(told, beyond + 0.05, ACCELERATION, chain))
+    refused('would go to', line(start, beyond + 0.05, ACCELERATION, chain))
     # What is planned faster than the limit of acceleration is slowed down.
-    fast = line(told, target, 4 * ACCELERATION, chain)
+    fast = line(start, target, 4 * ACCELERATION, chain)
     slowed = corrected_for_controller(fast, arm, gate, correction, TOLERANCE_M)
     assert 'slowed down to' in slowed.notes[0]
     assert slowed.end_s > 1.5 * fast.times_s[-1]

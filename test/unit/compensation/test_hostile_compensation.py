@@ -23,8 +23,8 @@ def text(tmp_path_factory):
 def numbers(value, where=()):
     """Yield the place of each number of a file."""
     if isinstance(value, dict | list):
-        for key, one in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from numbers(one, (*where, key))
+        for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from numbers(item, (*where, key))
     elif isinstance(value, int | float) and not isinstance(value, bool):
         yield where
 

@@ -78,8 +78,8 @@ def test_the_true_arm_is_within_the_clearance_of_the_one_that_is_checked(tmp_pat
     for link in range(1, len(CHAIN)):
         arms = checked[:, link, None, :3, 3] - checked[:, :link, :3, 3]
         levers = np.linalg.norm(np.linalg.norm(np.cross(axes[:, :link], arms), axis=-1), axis=-1)
-        away = levers > 0.05
-        used += [*(off[away, link] / (unknown * levers[away]))]
+        is_far = levers > 0.05
+        used += [*(off[is_far, link] / (unknown * levers[is_far]))]
     assert 0.3 < np.max(used) < 1.0
     # What is left of the offsets alone would not do.
     assert np.max(used) * unknown > 1.5 * KNOWN_OFFSET_RAD
@@ -116,10 +116,10 @@ def test_commands_are_those_of_the_file_whatever_becomes_of_it(tmp_path):
     np.testing.assert_allclose(done.command, expected.command, atol=1e-9)
     np.testing.assert_allclose(done.command - done.change, wanted, atol=1e-12)
     assert not done.refused
-    told = [f'solution {row} is near a singularity' for row in np.flatnonzero(done.incomplete)]
+    remarks = [f'solution {row} is near a singularity' for row in np.flatnonzero(done.incomplete)]
     assert np.array_equal(done.incomplete, expected.incomplete)
-    assert told
-    assert [note.split(':')[0] for note in done.notes] == told
+    assert remarks
+    assert [note.split(':')[0] for note in done.notes] == remarks
     # A stop of the planner.
     assert len(correction.commands(wanted[:0]).command) == 0
 
@@ -162,8 +162,8 @@ def test_what_is_not_of_this_arm_or_too_large_is_one_line(tmp_path):
     far = save(tmp_path, arm(URDF, joint_offsets=offsets), URDF)
     refused(rf'would change {CHAIN.joint_names[3]} by up to 2\.1\d degrees, and 2 are', far)
     offsets[3] = np.radians(1.9)
-    near = in_use(save(tmp_path, arm(URDF, joint_offsets=offsets), URDF))
-    assert near.remarks == []
+    correction = in_use(save(tmp_path, arm(URDF, joint_offsets=offsets), URDF))
+    assert correction.remarks == []
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ def test_no_limit_is_passed_and_the_path_stays(name):
     """Random paths through singularities; by differences of what is drawn."""
     model = erring(name, 8)
     k = model.joints
-    stretched, left = [], []
+    stretched, distances = [], []
     for seed in range(3):
         t, q, v = a_path(model, 20 + seed)
         # The wrist passes through its singularity.
@@ -78,7 +78,7 @@ def test_no_limit_is_passed_and_the_path_stays(name):
         h = wanted[1] - wanted[0]
         speed, acceleration = np.gradient(path, h, axis=0), np.diff(path, 2, axis=0) / h**2
         # What the wanted path needs: all that is added has to be made up for by time.
-        limits = [np.full(k, np.abs(one).max()) for one in (speed, acceleration)]
+        limits = [np.full(k, np.abs(rates).max()) for rates in (speed, acceleration)]
         found = corrected_trajectory(
             Compensator(model),
             *(t, q, v),
@@ -90,7 +90,7 @@ def test_no_limit_is_passed_and_the_path_stays(name):
         stretched.append(found.stretched)
         at = np.linspace(found.times_s[0], found.times_s[-1], 40001)
         sent = drawn(found.times_s, found.positions, found.velocities, at)
-        left.append(off_path(model, sent, drawn(t, q, v, at / found.stretched)))
+        distances.append(off_path(model, sent, drawn(t, q, v, at / found.stretched)))
         h = at[1] - at[0]
         # The limits themselves were taken from differences.
         assert np.all(np.abs(np.diff(sent, axis=0) / h) <= limits[0] * (1 + 1e-4))
@@ -99,7 +99,7 @@ def test_no_limit_is_passed_and_the_path_stays(name):
         assert np.all(np.isfinite(found.added_speed))
     assert max(stretched) > 1.0
     # Of some millimetres: by a fade of singular directions 0.3 mm RMS were left.
-    assert np.median(left) < 0.05e-3
+    assert np.median(distances) < 0.05e-3
 
 
 def test_it_begins_where_the_arm_is():

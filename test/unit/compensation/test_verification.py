@@ -24,10 +24,12 @@ STATES = {'in_use': 1.0, 'not_in_use': 0.0, 'twice': 2.0, 'wrong_sign': -1.0}
 def test_a_state_is_called(state, noise_mm):
     """Random states, of which each is not told in less than 5 %: 3 in 3 fail once in 8,000."""
     found = [verify(*measured(Case(seed, 0.3, noise_mm, state))) for seed in range(3)]
-    assert state in {one.verdict for one in found}
-    assert {one.verdict for one in found} <= {state, 'unclear'}
-    for one in found:
-        assert one.absolute.share == pytest.approx(STATES[state], abs=5 * one.absolute.std + 0.02)
+    assert state in {result.verdict for result in found}
+    assert {result.verdict for result in found} <= {state, 'unclear'}
+    for result in found:
+        assert result.absolute.share == pytest.approx(
+            STATES[state], abs=5 * result.absolute.std + 0.02
+        )
     if state == 'in_use':
         assert found[0].remains_mm < 3.0 * noise_mm
     elif state != 'twice':
@@ -38,7 +40,7 @@ def test_a_state_is_called(state, noise_mm):
 def test_one_joint_of_the_wrong_sign_is_named(name):
     found = verify(*measured(Case(7, 0.3, 0.1, 'one joint', joint=2, name=name)))
     assert found.verdict == 'other'
-    verdicts = [one.verdict for one in found.joints.values()]
+    verdicts = [joint.verdict for joint in found.joints.values()]
     assert verdicts[2] == 'wrong_sign'
     assert verdicts.count('wrong_sign') == 1
     # Base and marker take up a constant change of the outermost joints: nothing tells of it but
@@ -48,14 +50,16 @@ def test_one_joint_of_the_wrong_sign_is_named(name):
 
 def test_what_is_too_small_is_unclear_with_the_poses_that_would_do():
     found = [verify(*measured(Case(seed, 0.01, 0.1, 'in_use'))) for seed in range(6)]
-    assert {one.verdict for one in found} <= {'unclear', 'in_use'}
-    unclear = [one for one in found if one.verdict == 'unclear']
+    assert {result.verdict for result in found} <= {'unclear', 'in_use'}
+    unclear = [result for result in found if result.verdict == 'unclear']
     assert unclear
-    counts = [one.poses for one in unclear if one.poses is not None]
+    counts = [result.poses for result in unclear if result.poses is not None]
     assert counts
     assert min(counts) > 10
     # So many do.
-    seed = next(s for s, one in enumerate(found) if one.verdict == 'unclear' and one.poses)
+    seed = next(
+        s for s, result in enumerate(found) if result.verdict == 'unclear' and result.poses
+    )
     more = Case(seed, 0.01, 0.1, 'in_use', poses=found[seed].poses)
     assert verify(*measured(more)).verdict == 'in_use'
     # Nothing tells nothing apart.
@@ -116,7 +120,7 @@ def test_one_joint_of_many_arms(offset_deg):
     for seed in range(1000, 1000 + ARMS):
         joint = 1 + seed % 5
         found = verify(*measured(Case(seed, offset_deg, 0.1, 'one joint', joint)))
-        signs = [one.verdict == 'wrong_sign' for one in found.joints.values()]
+        signs = [result.verdict == 'wrong_sign' for result in found.joints.values()]
         green += found.verdict in STATES
         named += signs[joint]
         blamed += sum(signs) > signs[joint]

@@ -166,10 +166,10 @@ def test_causes_that_the_poses_do_not_determine_are_left_out_with_the_reason(mon
     found = discover_session(session, rng=np.random.default_rng(3))
     assert found.verdict == 'unexplained'
     assert found.effects == ()
-    left = found.unexplained[0]
-    assert 'joint compliance' in left.next
-    assert 'hardly determine effect.compliance_2' in left.next
-    assert left.size_m == pytest.approx(found.gain.held_out_rms_before_m, rel=0.3)
+    error = found.unexplained[0]
+    assert 'joint compliance' in error.next
+    assert 'hardly determine effect.compliance_2' in error.next
+    assert error.size_m == pytest.approx(found.gain.held_out_rms_before_m, rel=0.3)
 
     def broken(session, **options):
         raise InsufficientDataError('too few poses')
@@ -306,10 +306,10 @@ def test_readings_that_remember_say_nothing_of_the_arm(seed):
 
     def remembering(session: Session) -> np.ndarray:
         rng = np.random.default_rng(seed)
-        left = 0.15e-3 * rng.standard_normal((len(session.measurements), 3))
-        for row in range(1, len(left)):
-            left[row] = 0.97 * left[row - 1] + np.sqrt(1.0 - 0.97**2) * left[row]
-        return left
+        wander = 0.15e-3 * rng.standard_normal((len(session.measurements), 3))
+        for row in range(1, len(wander)):
+            wander[row] = 0.97 * wander[row - 1] + np.sqrt(1.0 - 0.97**2) * wander[row]
+        return wander
 
     session = session_with(seed, sensor=remembering, pose_sigma_m=0.0)
     found = discover_session(session, rng=np.random.default_rng(0))
@@ -403,8 +403,8 @@ def test_a_session_that_does_not_show_a_cause_leaves_it_open():
     found = sagging_arm()
     session = session_with(21, sagging, pose_sigma_m=0.3e-3)
     torque = np.abs(CHAIN.gravity_torque(session.measurements.q)[:, [1, 3]])
-    near = np.argsort(torque[:, 0] / torque[:, 0].std() + torque[:, 1] / torque[:, 1].std())
-    still = session.select(np.sort(near[:25]))
+    order = np.argsort(torque[:, 0] / torque[:, 0].std() + torque[:, 1] / torque[:, 1].std())
+    still = session.select(np.sort(order[:25]))
     other = confirm(found, still, np.random.default_rng(0))
     (cause,) = other.effects
     assert cause.answer == 'open'
@@ -483,7 +483,7 @@ def test_another_robot_cannot_confirm():
 
 
 @pytest.mark.parametrize(
-    ('before', 'frozen', 'own', 'share'),
+    ('before', 'frozen', 'refitted_rms', 'share'),
     [
         (1.0, 0.5, 0.5, 1.0),
         (1.0, 0.8, 0.6, (1.0 - 0.64) / (1.0 - 0.36)),
@@ -494,8 +494,8 @@ def test_another_robot_cannot_confirm():
         (1.0, 1.0, 1.1, None),
     ],
 )
-def test_the_share_is_of_what_the_other_session_could_gain(before, frozen, own, share):
-    assert share_of_gain(before, frozen, own) == (share and pytest.approx(share))
+def test_the_share_is_of_what_the_other_session_could_gain(before, frozen, refitted_rms, share):
+    assert share_of_gain(before, frozen, refitted_rms) == (share and pytest.approx(share))
 
 
 @pytest.mark.parametrize('turns', [0, 1, -2])
@@ -536,7 +536,7 @@ def test_a_curve_reaches_over_both_sessions():
 
 
 @pytest.mark.parametrize(
-    ('shared', 'own', 'absent', 'answer'),
+    ('shared', 'own_size', 'absent', 'answer'),
     [
         (0.0, -4.0, -30.0, 'confirmed'),
         (-20.0, 0.0, -30.0, 'changed'),
@@ -547,8 +547,8 @@ def test_a_curve_reaches_over_both_sessions():
         (0.0, -0.2, -30.0, 'open'),
     ],
 )
-def test_the_evidence_answers(shared, own, absent, answer):
-    assert answer_of({'shared': shared, 'own': own, 'absent': absent}) == answer
+def test_the_evidence_answers(shared, own_size, absent, answer):
+    assert answer_of({'shared': shared, 'own': own_size, 'absent': absent}) == answer
 
 
 def test_numbers_in_sentences():
@@ -599,10 +599,10 @@ def test_errors_and_range_are_correlated_as_scipy_has_it():
 
 
 def test_what_the_search_has_not_found_is_not_decided():
-    (one,) = decisions(soft_joint(), [(Named('backlash', (3,)), Named('settling', (3,)))])
-    assert one.answer == 'neither'
-    assert one.log_evidence is None
-    assert one.sentence == (
+    (decision,) = decisions(soft_joint(), [(Named('backlash', (3,)), Named('settling', (3,)))])
+    assert decision.answer == 'neither'
+    assert decision.log_evidence is None
+    assert decision.sentence == (
         'the search now names neither backlash of joint 3 nor settling of joint 3'
     )
 
@@ -615,7 +615,7 @@ def test_odds_are_stated_as_the_error_that_is_as_rare(log_odds):
 
 def test_large_odds_are_finite_and_small_ones_leave_it_open():
     assert 50.0 < sigma_of(2000.0) < 100.0
-    one = Decision.of(SAG, BASE, 'open', -1.0)
-    assert one.sentence == (
+    decision = Decision.of(SAG, BASE, 'open', -1.0)
+    assert decision.sentence == (
         'still open: base compliance or joint compliance of joint 2; 0.6 sigma for the first'
     )

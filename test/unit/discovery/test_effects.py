@@ -75,10 +75,13 @@ def test_columns_of_some_rows_are_those_they_have_among_all(name):
     for candidate in candidates_of(name):
         if candidate.name == 'gear_periodic' and candidate.label != '7':
             continue
-        whole, some = candidate.columns(scene), candidate.columns(part)
-        assert whole.at == some.at
+        all_columns, part_columns = candidate.columns(scene), candidate.columns(part)
+        assert all_columns.at == part_columns.at
         np.testing.assert_allclose(
-            some.displacement(part), whole.displacement(scene)[rows], rtol=1e-9, atol=1e-12
+            part_columns.displacement(part),
+            all_columns.displacement(scene)[rows],
+            rtol=1e-9,
+            atol=1e-12,
         )
 
 
@@ -128,8 +131,8 @@ def test_geometry_columns_are_those_of_a_chain_built_that_way(name):
         T_fixed = CHAIN.T_fixed.copy()
         if name == 'link_length':
             link = candidate.joints[0]
-            own = CHAIN.T_fixed[link][:3, 3]
-            axis = own / np.linalg.norm(own) if candidate.variant == 'along' else None
+            offset = CHAIN.T_fixed[link][:3, 3]
+            axis = offset / np.linalg.norm(offset) if candidate.variant == 'along' else None
             step = STEP * (np.eye(3)['xyz'.index(candidate.variant)] if axis is None else axis)
             T_fixed[link] = transform(np.eye(3), step) @ T_fixed[link]
         else:
@@ -288,8 +291,8 @@ def test_a_curve_has_zero_mean_and_every_other_shape_of_its_splines(turns_over, 
     np.testing.assert_allclose(splines.sum(axis=1), 1.0)
     # With the constant it spans what the splines span.
     joined = np.column_stack((np.ones(len(x)), columns))
-    left = splines - joined @ np.linalg.lstsq(joined, splines, rcond=None)[0]
-    assert np.abs(left).max() < 1e-9
+    remainder = splines - joined @ np.linalg.lstsq(joined, splines, rcond=None)[0]
+    assert np.abs(remainder).max() < 1e-9
     assert columns.shape[1] == splines.shape[1] - 1 == len(curve.places) == len(curve.penalty)
 
 

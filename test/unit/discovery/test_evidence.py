@@ -30,11 +30,11 @@ def scene() -> tuple[Any, list[Candidate]]:
     return session, candidates
 
 
-def assert_near(grams, others, size):
+def assert_near(grams, expected, size):
     """Packed Gram matrices agree to rounding, in units of their columns."""
-    unit = np.sqrt(others[:, packed.diagonal(size)])
+    unit = np.sqrt(expected[:, packed.diagonal(size)])
     i, j = np.tril_indices(size)
-    assert np.max(np.abs(grams - others) / (1e-300 + unit[:, i] * unit[:, j])) < 1e-9
+    assert np.max(np.abs(grams - expected) / (1e-300 + unit[:, i] * unit[:, j])) < 1e-9
 
 
 @pytest.mark.parametrize(

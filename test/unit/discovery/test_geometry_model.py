@@ -119,10 +119,12 @@ def held_out_mean(session: Session, urdf: str) -> float:
         T, _ = register_points(measurements.position[fitted], points[fitted])
         # The marker by least squares in turn with the registration.
         turned = np.einsum('ij,njk->nik', T[:3, :3], tool[:, :3, :3])
-        left = measurements.position - np.einsum('ij,nj->ni', T[:3, :3], tool[:, :3, 3]) - T[:3, 3]
-        marker = np.linalg.lstsq(turned[fitted].reshape(-1, 3), left[fitted].ravel(), rcond=None)[
-            0
-        ]
+        differences = (
+            measurements.position - np.einsum('ij,nj->ni', T[:3, :3], tool[:, :3, 3]) - T[:3, 3]
+        )
+        marker = np.linalg.lstsq(
+            turned[fitted].reshape(-1, 3), differences[fitted].ravel(), rcond=None
+        )[0]
     predicted = np.einsum('ij,nj->ni', T[:3, :3], points) + T[:3, 3]
     error = np.linalg.norm(measurements.position - predicted, axis=1)
     return float(error[measurements.is_validation].mean())
@@ -187,9 +189,9 @@ def test_each_result_that_can_be_loaded_has_its_own_held_out_error(tmp_path: Pat
         loaded = errors_with_model_mm(session, urdf)[held_out].mean()
         assert loaded == pytest.approx(mean, rel=0.05), name
     # What zero-offsets alone leave is least with those that were fitted alone.
-    apart = remaster_ros.fit(session)
+    fit = remaster_ros.fit(session)
     assert means[0] == pytest.approx(
-        1e3 * np.linalg.norm(apart.residuals_after[held_out], axis=1).mean(), rel=0.01
+        1e3 * np.linalg.norm(fit.residuals_after[held_out], axis=1).mean(), rel=0.01
     )
 
 

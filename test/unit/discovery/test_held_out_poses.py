@@ -29,8 +29,10 @@ def near_together(seed: int) -> Session:
     """Return a session with the fifth of its poses to fit that lie nearest to their middle."""
     session = session_with(seed, poses=40, validation=12, pose_sigma_m=0.1e-3)
     m = session.measurements
-    away = np.linalg.norm(m.position - m.position[~m.is_validation].mean(axis=0), axis=1)
-    return session.select(m.is_validation | (away < np.quantile(away[~m.is_validation], 0.2)))
+    distance = np.linalg.norm(m.position - m.position[~m.is_validation].mean(axis=0), axis=1)
+    return session.select(
+        m.is_validation | (distance < np.quantile(distance[~m.is_validation], 0.2))
+    )
 
 
 @pytest.mark.parametrize(

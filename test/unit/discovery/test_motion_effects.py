@@ -67,13 +67,13 @@ def test_clocks_move_the_arm_on_in_time(scene):
 
 @pytest.mark.parametrize('joint', [1, 2, 4])
 def test_lag_and_inertia_turn_one_joint(scene, joint):
-    q, one = scene.measurements.q, np.eye(len(CHAIN))[joint - 1]
+    q, unit = scene.measurements.q, np.eye(len(CHAIN))[joint - 1]
     t = scene.measurements.stamp_s
-    late = q + one * (q_at(t + 1e-5) - q) / 1e-5 * 1e-6
+    late = q + unit * (q_at(t + 1e-5) - q) / 1e-5 * 1e-6
     expected = (points(scene, late) - points(scene, q)) / 1e-6
     np.testing.assert_allclose(column(scene, 'joint_lag', joint - 1), expected, atol=1e-4)
     torque = scene.motion.inertial_torque[:, [joint - 1]]
-    bent = (points(scene, q + 1e-6 * one * torque) - points(scene, q)) / 1e-6
+    bent = (points(scene, q + 1e-6 * unit * torque) - points(scene, q)) / 1e-6
     inertia = column(scene, 'inertial_deflection', joint - 1)
     np.testing.assert_allclose(inertia, bent, atol=1e-4 * np.abs(bent).max())
 
@@ -140,11 +140,11 @@ def test_discover_names_friction_and_says_how_late_stamps_are(tmp_path, capsys):
     found = json.loads((tmp_path / 'd' / 'discovery.json').read_text(encoding='utf-8'))
     late = found['clocks']['bar']
     assert abs(-late['late_ms'] - 1e3 * recording.delay_s) < 4.0 * late['std_ms']
-    friction = next(one for one in found['effects'] if one['name'] == 'friction_windup')
+    friction = next(effect for effect in found['effects'] if effect['name'] == 'friction_windup')
     # Two joints of the largest wind-up are among those named.
     largest = np.argsort(-np.abs(recording.windup_rad))[:2] + 1
     assert {*largest.tolist()} & {*friction['joints']}
-    for one in friction['parameters']:
-        if one['name'].startswith('windup'):
-            truth = -recording.windup_rad[int(one['name'][-1]) - 1]
-            assert abs(one['value'] - truth) < 5.0 * one['std'] + 2e-5
+    for parameter in friction['parameters']:
+        if parameter['name'].startswith('windup'):
+            truth = -recording.windup_rad[int(parameter['name'][-1]) - 1]
+            assert abs(parameter['value'] - truth) < 5.0 * parameter['std'] + 2e-5

@@ -62,7 +62,7 @@ def test_a_fit_tells_that_its_model_does_not_hold(fitted):
 def test_a_search_is_not_green(fitted):
     found = discover_session(fitted.session, rng=np.random.default_rng(0))
     assert found.verdict in ('unexplained', 'effects')
-    assert [left.where for left in found.unexplained] == ['noise']
+    assert [error.where for error in found.unexplained] == ['noise']
     judged = discovery_content(found).judgement
     assert judged.mood == 'caution'
 
@@ -72,7 +72,7 @@ def check(error_m: float, stated_m: float | None = None, within_m: float | None 
 
 
 @pytest.mark.parametrize(
-    ('one', 'explained'),
+    ('result', 'explained'),
     [
         (check(6e-3), None),
         (check(12e-3), False),
@@ -83,6 +83,6 @@ def check(error_m: float, stated_m: float | None = None, within_m: float | None 
         (check(12e-3, stated_m=7e-3), True),
     ],
 )
-def test_noise_is_as_large_as_an_arm_errs_or_as_samples_show(one, explained):
-    assert one.explained is explained
-    assert bool(one.no_instrument) == (explained is False)
+def test_noise_is_as_large_as_an_arm_errs_or_as_samples_show(result, explained):
+    assert result.explained is explained
+    assert bool(result.no_instrument) == (explained is False)

@@ -42,7 +42,7 @@ def scene(with_held_out: bool) -> tuple[Residuals, list[tuple[Candidate, ...]], 
         (candidate('encoder_eccentricity', 2), candidate('encoder_scale', 2)),
         (candidate('joint_error_curve', 2),),
     ]
-    solution = solve(data, [one for group in groups for one in group])
+    solution = solve(data, [member for group in groups for member in group])
     assert solution is not None
     return data, groups, solution
 
@@ -61,13 +61,15 @@ def test_shares_are_what_fits_without_each_cause_lose(found, monkeypatch):
     held_out = data.context.measurements.is_validation
     rows = held_out if held_out.any() else np.isin(np.arange(len(held_out)), data.rows.source)
 
-    def left(*causes: int) -> float:
+    def remaining_square(*causes: int) -> float:
         fit = solve(data, [c for i in causes for c in groups[i]], solution)
         assert fit is not None
         return rms(data.unexplained(fit), rows) ** 2
 
-    every, none = left(0, 1, 2), left()
-    lost = np.array([left(1, 2), left(0, 2), left(0, 1)]) - every
+    every, none = remaining_square(0, 1, 2), remaining_square()
+    lost = (
+        np.array([remaining_square(1, 2), remaining_square(0, 2), remaining_square(0, 1)]) - every
+    )
     expected = lost / (none - every)
     print(np.round(expected, 3))
     assert shares(data, groups, solution) == pytest.approx(expected, abs=1e-4)

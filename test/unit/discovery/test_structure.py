@@ -127,7 +127,7 @@ def test_a_step_is_dated_also_where_held_out_readings_lie_between():
     found = discover_session(replace(session, measurements=m), rng=np.random.default_rng(0))
     (effect,) = found.effects
     assert effect.form == 'step'
-    (moment,) = [one for one in effect.parameters if one.name == 'moment']
+    (moment,) = [parameter for parameter in effect.parameters if parameter.name == 'moment']
     start = stamp_s.min()
     assert low - start < moment.value < high - start
     # Nothing tells when in the gap.
@@ -170,7 +170,7 @@ def test_readings_of_the_configuration_before_are_called_wrongly_paired():
     session = replace(session, measurements=replace(m, position=position))
     found = discover_session(session, rng=np.random.default_rng(0))
     assert found.verdict == 'unexplained'
-    (pairing,) = [left for left in found.unexplained if left.where == 'pairing']
+    (pairing,) = [error for error in found.unexplained if error.where == 'pairing']
     assert pairing.p_value < 1e-6
     # One or two of them may have stood so near that the reading is no gross error.
     assert 9 <= int(pairing.next.split()[0]) <= 12
@@ -185,7 +185,7 @@ def test_held_out_poses_that_err_more_are_not_passed_over():
 
     found = discover_session(session_with(35, sensor=grown), rng=np.random.default_rng(0))
     assert found.verdict == 'unexplained'
-    assert [left.where for left in found.unexplained] == ['held_out_poses']
+    assert [error.where for error in found.unexplained] == ['held_out_poses']
 
 
 @pytest.mark.qualify

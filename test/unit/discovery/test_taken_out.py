@@ -27,9 +27,9 @@ def test_only_a_certain_error_of_the_measurement_is_taken_out(monkeypatch):
         doubting.setattr(explain, 'CERTAIN', np.inf)
         doubtful = found()
     certain = found()
-    for one in certain, doubtful:
-        assert one.geometry is not None
-        assert [e.name for e in one.effects if e.of_measurement] == ['sensor_scale']
+    for result in certain, doubtful:
+        assert result.geometry is not None
+        assert [e.name for e in result.effects if e.of_measurement] == ['sensor_scale']
     assert all(e.is_taken_out for e in certain.effects if e.of_measurement)
     assert any('scale' in name for name in certain.alone.theta_names)
     assert doubtful.alone.theta_names == ()

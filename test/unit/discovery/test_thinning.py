@@ -109,18 +109,18 @@ def sagging(session):
 @pytest.mark.qualify
 def test_a_part_tells_the_cause_and_the_other_rows_confirm_it(monkeypatch):
     session = session_with(21, sagging, poses=120)
-    whole = discovered(session)
-    assert whole.thinning is None
+    full_result = discovered(session)
+    assert full_result.thinning is None
     monkeypatch.setattr(discover, 'draw_rows', partial(draw_rows, most=250))
     part = discovered(session)
-    for found in (whole, part):
+    for found in (full_result, part):
         assert [(e.name, e.joints) for e in found.effects] == [('joint_compliance', (2,))]
     thinning = part.thinning
     fitted = int(np.sum(~session.measurements.is_validation))
     assert 200 < thinning.searched < 300 < thinning.rows <= fitted
     assert len(part.residuals) == thinning.searched
     assert thinning.others_rms_after_m < 0.8 * thinning.others_rms_before_m
-    (parameter,), (other,) = part.effects[0].parameters, whole.effects[0].parameters
+    (parameter,), (other,) = part.effects[0].parameters, full_result.effects[0].parameters
     assert abs(parameter.value - 5e-5) < 4.0 * parameter.std
     # Fewer rows were searched; what was found is fitted to all of them.
     assert abs(parameter.value - other.value) < other.std
@@ -143,11 +143,13 @@ def test_forgotten_displacements_are_computed_again(monkeypatch):
     monkeypatch.setattr(residuals, 'KEPT_BYTES', 1)
     forgotten = discovered(session)
     assert len(forgotten.residuals._displacements) == 1
-    for one, other in zip(
+    for parameter, other in zip(
         forgotten.effects[0].parameters, kept.effects[0].parameters, strict=True
     ):
         # But for rounding: products are summed in another order.
-        assert (one.value, one.std) == pytest.approx((other.value, other.std), rel=1e-9)
+        assert (parameter.value, parameter.std) == pytest.approx(
+            (other.value, other.std), rel=1e-9
+        )
     assert forgotten.solution.log_evidence == pytest.approx(kept.solution.log_evidence, rel=1e-9)
 
 
@@ -155,7 +157,7 @@ def test_forgotten_displacements_are_computed_again(monkeypatch):
 def test_what_a_fit_leaves_does_not_depend_on_blocks(monkeypatch):
     found = discovered(session_with(21, sagging))
     data, solution = found.residuals, found.solution
-    whole = data.unexplained(solution)
+    full_residuals = data.unexplained(solution)
     blocks = type(data.context).blocks
     monkeypatch.setattr(type(data.context), 'blocks', lambda scene: blocks(scene, 7))
-    np.testing.assert_allclose(data.unexplained(solution), whole, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(data.unexplained(solution), full_residuals, rtol=0.0, atol=1e-12)

@@ -46,12 +46,12 @@ def test_an_offset_that_only_a_prior_determines_is_known_no_better_for_it(marker
     std = offsets_of(found)[1][6]
     print('std by the fit, deg', np.degrees(std))
     moves = Unmodelled.of(found, data, nothing).by_open_offsets()
-    held = (std**-2.0 + STEP_STD**-2.0 - OFFSET_STD**-2.0) ** -0.5
-    if held > 0.95 * std:
+    data_std = (std**-2.0 + STEP_STD**-2.0 - OFFSET_STD**-2.0) ** -0.5
+    if data_std > 0.95 * std:
         assert moves.shape[1] == 0
         return
     (move,) = moves.T
-    assert np.hypot(held, move[6]) == pytest.approx(std, rel=0.02)
+    assert np.hypot(data_std, move[6]) == pytest.approx(std, rel=0.02)
     # The marker goes along, so that it is seen where it was.
     model = found.model
     marker = model.natural(found.mode.z)[model.marker(0)]
@@ -72,10 +72,10 @@ def test_all_else_goes_along_with_an_open_offset():
     inner = [move for move in moves.T if np.argmax(np.abs(move[:7])) < 6]
     assert inner
     for move in inner:
-        alone = np.where(np.arange(len(move)) == np.argmax(np.abs(move[:7])), move, 0.0)
+        offset_step = np.where(np.arange(len(move)) == np.argmax(np.abs(move[:7])), move, 0.0)
         by_itself, together = (
             np.abs(predict(found.model.pinned(x + step), rows) - before).max()
-            for step in (alone, move)
+            for step in (offset_step, move)
         )
         print('largest change, m: the offset by itself', by_itself, 'with all else', together)
         assert together < 0.2 * by_itself
@@ -87,9 +87,11 @@ def test_an_offset_that_the_data_determine_beside_the_causes_needs_no_more():
     found = estimate(Problem.of(session))
     data = Residuals.of(found)
     waves = [
-        one for one in EFFECTS['gear_periodic'].candidates(data.context) if one.joints == (4,)
+        candidate
+        for candidate in EFFECTS['gear_periodic'].candidates(data.context)
+        if candidate.joints == (4,)
     ]
-    (wave,) = (one for one in waves if one.parameters[0] == 'sin3_4')
+    (wave,) = (candidate for candidate in waves if candidate.parameters[0] == 'sin3_4')
     solution = solve(data, (wave,))
     assert solution is not None
     std = offsets_of(found)[1][1:6]

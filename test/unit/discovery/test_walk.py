@@ -92,12 +92,12 @@ def test_a_block_that_joins_and_leaves_changes_nothing():
 
 def test_a_model_that_is_refused_costs_no_product_with_all_columns():
     ground = Surface(pool(), scene().noise, {})
-    first, *others = np.flatnonzero(pool().sizes == 1).tolist()
+    first, *further_blocks = np.flatnonzero(pool().sizes == 1).tolist()
     state = State.of(ground, ((first, 2),))
-    known = state.with_block(others[0], 2).value, state.without(0).value
+    known = state.with_block(further_blocks[0], 2).value, state.without(0).value
     fetched = [ground.is_known(block) for block in range(len(pool().blocks))]
     assert np.flatnonzero(fetched).tolist() == [first]
-    exact = State.of(ground, ((first, 2), (others[0], 2))).value
+    exact = State.of(ground, ((first, 2), (further_blocks[0], 2))).value
     assert known == (pytest.approx(exact, abs=1e-3), pytest.approx(0.0, abs=1e-3))
 
 
@@ -107,15 +107,19 @@ def test_a_pool_that_grows_makes_the_surface_grow():
     grown = Pool(data, pool().blocks[:20])
     kinds = {candidates()[0]: 1e-4}
     before = Surface(grown, data.noise, {})
-    one = Surface(grown, data.noise, kinds, before)
-    assert one.room is before.room
+    grown_surface = Surface(grown, data.noise, kinds, before)
+    assert grown_surface.room is before.room
     grown.extend(pool().blocks[20:])
-    one.extend()
-    whole = Surface(pool(), data.noise, kinds)
-    assert one.has(data.noise, kinds)
-    assert not one.has(data.noise, {})
-    np.testing.assert_allclose(one.columns, whole.columns, atol=1e-5 * np.abs(whole.columns).max())
-    np.testing.assert_allclose(one.square, whole.square, rtol=1e-4, atol=1.0)
+    grown_surface.extend()
+    fresh_surface = Surface(pool(), data.noise, kinds)
+    assert grown_surface.has(data.noise, kinds)
+    assert not grown_surface.has(data.noise, {})
+    np.testing.assert_allclose(
+        grown_surface.columns,
+        fresh_surface.columns,
+        atol=1e-5 * np.abs(fresh_surface.columns).max(),
+    )
+    np.testing.assert_allclose(grown_surface.square, fresh_surface.square, rtol=1e-4, atol=1.0)
     for mine, fresh in zip(grown.excluded, pool().excluded, strict=True):
         np.testing.assert_array_equal(mine, fresh)
     np.testing.assert_allclose(grown.log_prior, pool().log_prior)
@@ -143,7 +147,7 @@ def test_a_chain_visits_models_by_their_posterior():
     best = max(walker.seen, key=lambda model: walker.seen[model])
     # All models of at most two blocks, at all levels.
     options = [(b, int(a)) for b in range(len(few.blocks)) for a in np.flatnonzero(few.allowed[b])]
-    every = [(), *((one,) for one in options)]
+    every = [(), *((option,) for option in options)]
     every += [(x, y) for x in options for y in options if x[0] < y[0]]
     values = {
         tuple(sorted(model)): State.of(ground, model).value
@@ -227,5 +231,5 @@ def test_the_losses_of_blocks_are_those_of_the_models_without_them():
     model = tuple((block, 3) for block in [*sizes[0], *sizes[1]])
     state = State.of(surface(), model)
     for position in range(len(model)):
-        rest = State.of(surface(), model[:position] + model[position + 1 :])
-        assert state.losses[position] == pytest.approx(state.value - rest.value, abs=2e-2)
+        reduced_state = State.of(surface(), model[:position] + model[position + 1 :])
+        assert state.losses[position] == pytest.approx(state.value - reduced_state.value, abs=2e-2)

@@ -58,12 +58,12 @@ def test_no_sentence_names_a_thing_twice_or_has_a_plural_with_a_singular_verb(co
     for group in groups(context):
         joints = tuple(sorted({joint for candidate in group for joint in candidate.joints}))
         draws = np.full((2, group[0].size), 1e-4)
-        told = [
+        sentences = [
             in_words(group, context),
             titled(group[0], joints),
             EFFECTS[group[0].name].size(context, group[0], draws),
         ]
-        for text in told:
+        for text in sentences:
             assert not re.search(r'\b(sensor|marker) \1\b', text, re.IGNORECASE), text
             assert not re.search(r'(?<!of )joints \d and \d (still )?(\w+s|is|has)\b', text), text
             assert '{' not in text

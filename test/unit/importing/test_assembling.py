@@ -135,23 +135,23 @@ def test_equal_goals_are_one_pose_and_every_run_of_poses_holds_one_out(do):
     made = run(HEADER, [*np.rad2deg(q).T, *(1e3 * points.T)]).measurements
     assert made.pose.tolist() == [i // 2 for i in range(48)]
     assert made.configuration.tolist() == list(range(48))
-    held = np.unique(made.pose[made.is_validation])
-    assert len(held) == 6
-    assert np.unique(held // 4).tolist() == [0, 1, 2, 3, 4, 5]
+    held_out = np.unique(made.pose[made.is_validation])
+    assert len(held_out) == 6
+    assert np.unique(held_out // 4).tolist() == [0, 1, 2, 3, 4, 5]
     assert np.all(made.is_validation[0::2] == made.is_validation[1::2])
 
 
 def test_the_seed_decides_what_is_held_out(do, tmp_path):
     arm, run = do
-    held = []
+    held_out = []
     for seed in (0, 0, 1):
         made = run(HEADER, columns(arm), '--seed', seed).measurements
-        held.append(np.flatnonzero(made.is_validation).tolist())
+        held_out.append(np.flatnonzero(made.is_validation).tolist())
         for path in (tmp_path / 'session').iterdir():
             path.unlink()
         (tmp_path / 'session').rmdir()
-    assert held[0] == held[1] != held[2]
-    assert len(held[0]) == 12
+    assert held_out[0] == held_out[1] != held_out[2]
+    assert len(held_out[0]) == 12
 
 
 def test_poses_splits_sensors_and_markers_of_the_table_are_kept(do):
@@ -218,8 +218,8 @@ def test_what_a_pad_counts_otherwise_is_proposed_and_undone(do, joint, share, sa
     """``share``: of the joint itself, of that before it, and degrees, in what the table has."""
     arm, run = do
     q = np.rad2deg(arm.q)
-    own, before, added = share
-    q[:, joint] = own * q[:, joint] + before * q[:, joint - 1] + added
+    factor, before, added = share
+    q[:, joint] = factor * q[:, joint] + before * q[:, joint - 1] + added
     table = [*q.T, *(1e3 * arm.points.T)]
     error = run(HEADER, table)
     assert said in error

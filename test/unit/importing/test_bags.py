@@ -184,10 +184,10 @@ def test_a_camera_with_a_clock_of_its_own_is_matched_by_standstills(chain, tmp_p
             for step in range(int(50 * length_s)):
                 time_s = start + 0.02 * step
                 # Moving for a second, to where it stops.
-                left = max(0.0, 1.0 - 0.02 * step)
+                distance = max(0.0, 1.0 - 0.02 * step)
                 before = max(i - 1, 0)
-                q = stops[i] + left * (stops[before] - stops[i])
-                xyz = place[i] + left * (place[before] - place[i]) + rng.normal(0.0, 1e-5, 3)
+                q = stops[i] + distance * (stops[before] - stops[i])
+                xyz = place[i] + distance * (place[before] - place[i]) + rng.normal(0.0, 1e-5, 3)
                 camera = point(time_s - 1.6e9, '/camera/marker', xyz)
                 for topic, kind, message, _ in (joints(time_s, q), camera):
                     data = bytes(STORE.serialize_cdr(message, kind))
@@ -249,11 +249,11 @@ def test_what_a_message_names_is_a_sensor(made, plugin, chain, tmp_path):
                 at = int((time_s - START_S) / 4.0)
                 places = {'wall': (5.0, 5.0, 5.0), 'tag:7': (at, 1.0, 2.0), 'tool': (at, 0.0, 0.0)}
                 both = (topic, kind, message, time_s), made(store, time_s, places)
-                for own, of, content, when in both:
-                    if own not in connections:
-                        connections[own] = writer.add_connection(own, of, typestore=store)
+                for channel, of, content, when in both:
+                    if channel not in connections:
+                        connections[channel] = writer.add_connection(channel, of, typestore=store)
                     data = store.serialize_cdr(content, of)
-                    writer.write(connections[own], int(1e9 * when), data)
+                    writer.write(connections[channel], int(1e9 * when), data)
     rows = read_bag(folder, chain, clock_offset_s=0.0, links=('tool', '/rigid_bodies/tool'))
     assert len({*rows.labels['sensor']}) == 1
     np.testing.assert_allclose(rows.position, [[i, 1.0, 2.0] for i in range(3)])

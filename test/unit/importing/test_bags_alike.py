@@ -76,7 +76,7 @@ def stream_bag(folder, arm, joints, points):
     every = [(ms, '/joint_states', JOINT_STATE, q) for ms, q in joints]
     every += [(ms, '/camera/marker', POINT, p) for ms, p in points]
     with BagWriter(folder / 'bag') as writer:
-        for ms, topic, kind, values in sorted(every, key=lambda one: one[0]):
+        for ms, topic, kind, values in sorted(every, key=lambda item: item[0]):
             message = (
                 joint_state(STORE, ms, names, values)
                 if kind == JOINT_STATE
@@ -149,7 +149,7 @@ def test_a_message_a_pose_is_the_same_rows_as_a_table(plugin, arm, tmp_path):
     for name, definition in DEFINITIONS.items():
         store.register(get_types_from_msg(definition, name))
     header_of = [*arm.chain.joint_names, 'x', 'y', 'z']
-    columns = [[repr(float(v)) for v in one] for one in (*arm.q.T, *arm.points.T)]
+    columns = [[repr(float(v)) for v in column] for column in (*arm.q.T, *arm.points.T)]
     table = write(tmp_path, 't.csv', text(header_of, columns))
     right = read_rows([table], arm.chain, TableOptions(length='m', angles='rad'))
     folder = tmp_path / 'bag'

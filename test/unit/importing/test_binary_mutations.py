@@ -188,7 +188,7 @@ def bag_of(folder, plugin, arm):
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
                 writer.write(connections[topic], ns, STORE.serialize_cdr(message, kind))
-    (file,) = [one for one in folder.iterdir() if one.suffix in ('.mcap', '.db3')]
+    (file,) = [path for path in folder.iterdir() if path.suffix in ('.mcap', '.db3')]
     return file
 
 

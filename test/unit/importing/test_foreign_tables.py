@@ -111,12 +111,14 @@ def test_a_wrong_tip_is_named_by_the_marker(arm, imported, tmp_path):
 def test_a_name_that_the_table_has_otherwise_is_said_not_to_be_used(arm, imported, tmp_path):
     header = [*(f'{name} [deg]' for name in joint_names(arm)), 'x [mm]', 'y [mm]', 'z [mm]']
     columns = [*degrees(arm), *(1e3 * arm.points.T)]
-    own = write(tmp_path, 'own.csv', text([*header, 'sensor'], [*columns, ['lt'] * 40], ',', '.'))
-    (out, _), session = imported(arm.urdf, own, '--sensor', 'camera', '--marker', 'ball')
+    table = write(
+        tmp_path, 'own.csv', text([*header, 'sensor'], [*columns, ['lt'] * 40], ',', '.')
+    )
+    (out, _), session = imported(arm.urdf, table, '--sensor', 'camera', '--marker', 'ball')
     assert '--sensor camera is not used: the table names its sensors (lt)' in out
     assert session.sensors == {'lt': 'ball'}
     assert '--marker' not in out
-    assert 'not used' not in imported(arm.urdf, own, '--sensor', 'lt')[0].stdout
+    assert 'not used' not in imported(arm.urdf, table, '--sensor', 'lt')[0].stdout
 
 
 def test_a_cell_file_has_robot_sensor_and_marker(arm, tmp_path):
@@ -170,6 +172,6 @@ def test_json_has_the_columns_and_the_hint(arm, imported, tmp_path):
 def test_what_measured_is_known_by_its_name_or_is_said(arm, imported, tmp_path, options, kinds):
     """A lens is looked for only where there may be one."""
     header = ['A1', 'A2', 'A3', 'A4', 'A5', 'A6', 'X', 'Y', 'Z']
-    own = write(tmp_path, 'own.csv', text(header, [*np.rad2deg(arm.q).T, *(1e3 * arm.points).T]))
-    _, session = imported(arm.urdf, own, *options)
+    table = write(tmp_path, 'own.csv', text(header, [*np.rad2deg(arm.q).T, *(1e3 * arm.points).T]))
+    _, session = imported(arm.urdf, table, *options)
     assert session.sensor_kinds == kinds

@@ -63,7 +63,7 @@ def records_of(q, points):
 
 
 def json_lines(folder, q, points):
-    lines = [json.dumps(one) for one in records_of(q, points)]
+    lines = [json.dumps(record) for record in records_of(q, points)]
     return write(folder, 't.jsonl', '\n'.join(lines))
 
 

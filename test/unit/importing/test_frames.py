@@ -55,7 +55,7 @@ def test_rows_belong_together_by_their_index(labels, arm, frame, tmp_path):
     right = remaster_ros.session_from(frame(joints), frame(points), urdf).measurements
     order = np.random.default_rng(1).permutation(n)
     mixed = frame(
-        {name: np.asarray(own)[order] for name, own in joints.items()},
+        {name: np.asarray(column)[order] for name, column in joints.items()},
         index=[index[i] for i in order],
     )
     found = remaster_ros.session_from(mixed, frame(points, index=index), urdf).measurements

@@ -211,7 +211,7 @@ def changed_cell(other, true, broken):
     """
     assert len(other) <= 1, (broken, other)
     for row in other:
-        best = min(true, key=lambda one: sum(a != b for a, b in zip(one, row, strict=True)))
+        best = min(true, key=lambda line: sum(a != b for a, b in zip(line, row, strict=True)))
         changed = [b for a, b in zip(best, row, strict=True) if a != b]
         assert len(changed) == 1, (broken, row)
         return changed[0]

@@ -112,8 +112,8 @@ def test_the_offset_of_the_clocks_is_found(clock_s):
     # Its standard deviation is 0.2 ms: the error of the sensor follows the motion.
     assert session.clock_offset_s['bar'] == pytest.approx(clock_s, abs=1e-3)
     assert any('early' in line if clock_s > 0 else 'late' in line for line in how)
-    told, _ = imported(world, moved, clock_offset_s=clock_s)
-    assert told.clock_offset_s['bar'] == clock_s
+    session_at_offset, _ = imported(world, moved, clock_offset_s=clock_s)
+    assert session_at_offset.clock_offset_s['bar'] == clock_s
 
 
 def test_stamps_that_wander_are_replaced_by_the_constant_rate_of_the_frames():
@@ -138,14 +138,14 @@ def test_frames_of_no_constant_rate_keep_their_stamps():
     rng = np.random.default_rng(SEED)
     number = np.concatenate((np.arange(400), np.arange(9_000, 9_400), np.arange(9_411, 9_800)))
     regular = 5.0 + number / 119.9
-    near = regular + rng.normal(0.0, 5e-4, len(regular))
+    jittered_stamps = regular + rng.normal(0.0, 5e-4, len(regular))
 
     def frames(stamps):
         positions = np.zeros((len(stamps), 1, 3))
         return _Frames(np.sort(stamps), positions, np.zeros(1, int)).at_constant_rate()
 
     # Across a gap of a minute, too.
-    np.testing.assert_allclose(frames(near).stamps, regular, atol=1e-4)
+    np.testing.assert_allclose(frames(jittered_stamps).stamps, regular, atol=1e-4)
     assert frames(np.cumsum(rng.exponential(1.0 / 120.0, 1000))) is None
     assert frames(np.cumsum(rng.choice([0.008, 0.013], 1000))) is None
     assert frames(np.array([1.0])) is None
@@ -242,7 +242,7 @@ def test_markers_of_one_message_are_of_one_sensor(recording, monkeypatch):
 
     monkeypatch.setattr(bags, '_messages', messages)
     _, streams, columns = bags.read_streams(Path('bag'), CHAIN, point_topics=('/markers',))
-    assert [(one.sensor, one.marker) for one in streams] == [
+    assert [(stream.sensor, stream.marker) for stream in streams] == [
         ('markers', str(i)) for i in range(1, 5)
     ]
     assert columns['/markers/1'] == 'marker 1 of sensor markers, m'
@@ -363,9 +363,9 @@ def test_the_effective_turn_leaves_the_friction_of_the_whole_way():
 
 def test_what_cannot_be_measured_in_motion_is_refused(recording, tmp_path, capsys):
     world, recording = recording
-    some = slice(None, None, 10)
+    tenth = slice(None, None, 10)
     rare = replace(
-        recording, joint_stamps=recording.joint_stamps[some], joints=recording.joints[some]
+        recording, joint_stamps=recording.joint_stamps[tenth], joints=recording.joints[tenth]
     )
     with pytest.raises(InputError, match='joint states at 25 Hz; at least 40 Hz'):
         imported(world, rare)

@@ -77,8 +77,8 @@ def test_a_capture_of_vicon(objects, arm, run, tmp_path):
     assert_stops(rows, arm)
     assert {*rows.labels['marker']} == {'tool' if objects else 'arm:tool'}
     assert (rows.orientation is not None) == objects
-    left = 'sections left out' if not objects else 'base stays in its place'
-    assert left in ' '.join(rows.warnings)
+    remark = 'sections left out' if not objects else 'base stays in its place'
+    assert remark in ' '.join(rows.warnings)
 
 
 @pytest.mark.parametrize(

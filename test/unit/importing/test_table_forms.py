@@ -51,7 +51,7 @@ def assert_rows(rows, arm, which=slice(None)):
     np.testing.assert_allclose(rows.position, arm.points[which], atol=2e-6)
 
 
-def whole(arm, cell=str, separator=';'):
+def full_table(arm, cell=str, separator=';'):
     """Return a table of names, joints and points, each number written by `cell`."""
     columns = [[cell(value) for value in column] for column in (*degrees(arm), *millimetres(arm))]
     return text(['Punkt', *AXES, 'X', 'Y', 'Z'], [POINTS, *columns], separator)
@@ -69,12 +69,12 @@ def whole(arm, cell=str, separator=';'):
     ids=['thin blank', 'no-break blank', 'blank', 'apostrophe', 'minus sign'],
 )
 def test_numbers_as_spreadsheets_write_them(cell, arm, tmp_path):
-    assert_rows(rows_of(arm, tmp_path, whole(arm, cell)), arm)
+    assert_rows(rows_of(arm, tmp_path, full_table(arm, cell)), arm)
 
 
 @pytest.mark.parametrize('sign', [' ', "'", '\u00a0'])
 def test_a_stray_sign_is_no_group(sign, arm, tmp_path):
-    content = whole(arm, lambda v: f'{v:.6f}')
+    content = full_table(arm, lambda v: f'{v:.6f}')
     large = re.search(r'(?<=;)-?\d{4}\.\d+', content)[0]
     for wrong in (
         large.replace('.', f'{sign}', 1),
@@ -130,7 +130,7 @@ def test_a_pendants_words_of_which_some_are_numbered(tmp_path):
     ids=['old line ends', 'twice', 'Markdown', 'names like comments'],
 )
 def test_lines_that_are_no_rows(change, arm, tmp_path):
-    table = change(whole(arm, lambda v: f'{v:.6f}'))
+    table = change(full_table(arm, lambda v: f'{v:.6f}'))
     if table.startswith('| '):
         table = table.replace('\n', ' |\n| ').replace('|\n| | ', '|\n| ').removesuffix('| ')
     twice = table.count('Punkt') > 1
@@ -155,7 +155,7 @@ def test_rows_without_a_point_or_joints_are_left_out_and_listed(word, arm, tmp_p
 
 
 @pytest.mark.parametrize(
-    ('names', 'others', 'headers'),
+    ('names', 'other_names', 'headers'),
     [
         ([f'KR6_{p}' for p in POINTS], POINTS, ('Point', 'Point')),
         ([f'{p}_meas' for p in POINTS], [f'Pose {p[1:]}' for p in POINTS], ('Point', 'Point')),
@@ -166,13 +166,13 @@ def test_rows_without_a_point_or_joints_are_left_out_and_listed(word, arm, tmp_p
     ],
     ids=['prefix', 'suffix', 'decimals', 'any header', 'pose', 'index'],
 )
-def test_names_that_differ_in_what_all_have(names, others, headers, arm, tmp_path):
+def test_names_that_differ_in_what_all_have(names, other_names, headers, arm, tmp_path):
     order = np.random.default_rng(1).permutation(COUNT)[:-2]
     points = text(
         [headers[0], 'X', 'Y', 'Z'],
         [[names[i] for i in order], *(column[order] for column in millimetres(arm))],
     )
-    rows = rows_of(arm, tmp_path, points, joints_table(arm, others, headers[1]))
+    rows = rows_of(arm, tmp_path, points, joints_table(arm, other_names, headers[1]))
     assert_rows(rows, arm, order)
     assert 'rows joined by' in rows.description[-1]
 
@@ -705,8 +705,8 @@ def test_a_unit_that_is_not_converted_is_refused(unit, words, arm, tmp_path):
 def test_names_in_two_lines(arm, tmp_path):
     over = ';Joints;;;;;;Ball 1;;;Ball 2;;\n'
     header = ['Point', *AXES, *2 * 'XYZ', '']
-    beside = [column + 10.0 for column in millimetres(arm)]
-    table = text(header[:-1], [POINTS, *degrees(arm), *millimetres(arm), *beside], ';')
+    second_ball = [column + 10.0 for column in millimetres(arm)]
+    table = text(header[:-1], [POINTS, *degrees(arm), *millimetres(arm), *second_ball], ';')
     rows = rows_of(arm, tmp_path, over + table, chosen=ColumnChoice(points=('Ball 1',)))
     assert_rows(rows, arm)
     both = rows_of(arm, tmp_path, over + table)

@@ -73,8 +73,8 @@ class SrsArm:
                     )
                     roll = np.arctan2(flip * hand[..., 1, 2], flip * hand[..., 0, 2])
                     # What is left of the rotation turns about the last axis alone.
-                    rest = np.swapaxes(rot_z(roll) @ rot_y(swing), -1, -2) @ hand
-                    last = np.arctan2(rest[..., 1, 0], rest[..., 0, 0])
+                    remainder = np.swapaxes(rot_z(roll) @ rot_y(swing), -1, -2) @ hand
+                    last = np.arctan2(remainder[..., 1, 0], remainder[..., 0, 0])
                     joints = (turn, s2 * lean, q3 + 0 * bend, s4 * bend, roll, s6 * swing, last)
                     branches.append(np.stack(joints, axis=-1))
         return np.stack(branches, axis=-2)
@@ -82,5 +82,5 @@ class SrsArm:
 
 def _arccos(value):
     """Return the arc cosine; rounding past ±1 is a straight arm, further past is NaN."""
-    near = np.abs(value) < 1 + 1e-12
-    return np.arccos(np.where(near, np.clip(value, -1, 1), np.nan))
+    is_inside = np.abs(value) < 1 + 1e-12
+    return np.arccos(np.where(is_inside, np.clip(value, -1, 1), np.nan))

@@ -61,7 +61,7 @@ def test_distance_to_an_obstacle_face(shape, reach):
 
 def test_obstacles_stand_in_yaw():
     """A plate of 2 cm, a metre wide: broadside it is near, edge-on it is far."""
-    for yaw, apart in ((0.0, 0.39), (np.pi / 2, 0.4 - 0.5), (np.pi / 4, None)):
+    for yaw, clearance in ((0.0, 0.39), (np.pi / 2, 0.4 - 0.5), (np.pi / 4, None)):
         wall = obstacle(
             'wall', [0.4, 0, 0.5], [0.02, 1, 0.4], matrix_from_rpy(np.array([0, 0, yaw]))
         )
@@ -69,11 +69,11 @@ def test_obstacles_stand_in_yaw():
             planar_arm(1), [Body('ball', 1, sphere(0.01), at(0, 0, 0.2)), wall], **EXACT
         )
         found = distances(model, [0.0])['wall', 'ball']
-        if apart is None:
+        if clearance is None:
             # The line y = -(x - 0.4) ± 0.01 √2, from the origin.
             assert found == pytest.approx(0.4 / np.sqrt(2) - 0.01 - 0.01, abs=1e-6)
-        elif apart > 0:
-            assert found == pytest.approx(apart - 0.01, abs=1e-6)
+        elif clearance > 0:
+            assert found == pytest.approx(clearance - 0.01, abs=1e-6)
         else:
             assert found < 0
 

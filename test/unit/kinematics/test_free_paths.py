@@ -121,9 +121,9 @@ def test_on_a_way_out_nothing_gets_worse(lwr, seed):
     for short in found:
         worst[short.index] = min(worst[short.index], short.distance)
     # Within the margin, or a little in contact: where an arm comes to stand.
-    near = np.flatnonzero((worst > -0.02) & np.isfinite(worst))[:12]
+    starts = np.flatnonzero((worst > -0.02) & np.isfinite(worst))[:12]
     ways = 0
-    for i in near:
+    for i in starts:
         path = way_out(lwr, q[i], rng)
         if path is None:
             continue
@@ -134,9 +134,9 @@ def test_on_a_way_out_nothing_gets_worse(lwr, seed):
         bad = np.isin(pairs, [each.pair for each in short])
         assert np.all(np.diff(distances[:, bad], axis=0) > -1e-3)
         assert lwr.trouble(path[-1]) == ''
-        others = [s for s in lwr.shortfalls(path) if not bad[s.pair]]
-        assert others == []
-    assert ways >= 0.7 * len(near)
+        further_trouble = [s for s in lwr.shortfalls(path) if not bad[s.pair]]
+        assert further_trouble == []
+    assert ways >= 0.7 * len(starts)
 
 
 def test_a_way_that_comes_nearer_is_refused():

@@ -50,9 +50,9 @@ def wrapped(angles):
     return np.remainder(angles + np.pi, 2 * np.pi) - np.pi
 
 
-def distance(q, others):
-    """Return the largest joint difference of q (..., k) to each of others, modulo turns."""
-    return np.max(np.abs(wrapped(q[..., None, :] - others)), axis=-1)
+def distance(q, solutions):
+    """Return the largest joint difference of q (..., k) to each of solutions, modulo turns."""
+    return np.max(np.abs(wrapped(q[..., None, :] - solutions)), axis=-1)
 
 
 def distinct(q):
@@ -65,9 +65,9 @@ def distinct(q):
 
 
 def assert_certified(chain, solutions, T):
-    left = inverse(T) @ chain.forward(solutions)
-    assert np.all(np.linalg.norm(left[:, :3, 3], axis=1) < 1e-8)
-    turns = matrix_to_rotation_vector(left[:, :3, :3])
+    error = inverse(T) @ chain.forward(solutions)
+    assert np.all(np.linalg.norm(error[:, :3, 3], axis=1) < 1e-8)
+    turns = matrix_to_rotation_vector(error[:, :3, :3])
     assert np.all(np.linalg.norm(turns, axis=1) < 2e-8)
 
 
@@ -76,7 +76,7 @@ def poses_of(arm, q):
 
 
 @pytest.mark.parametrize(
-    ('robot', 'poses', 'held'),
+    ('robot', 'poses', 'held_angle'),
     [
         ('lwr4plus', 1000, 0.0),
         ('iiwa14', 500, 0.8),
@@ -84,15 +84,15 @@ def poses_of(arm, q):
         pytest.param('iiwa14', 3000, 0.8, marks=pytest.mark.qualify),
     ],
 )
-def test_the_judge_finds_the_same_solutions_of_random_poses(robot, poses, held):
+def test_the_judge_finds_the_same_solutions_of_random_poses(robot, poses, held_angle):
     seed = 20
     print('seed', seed)
     chain, arm = read_robot(robot), ARMS[robot]
-    ik = InverseKinematics(chain, {2: [held]})
+    ik = InverseKinematics(chain, {2: [held_angle]})
     q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (poses, 7))
-    q[:, 2] = held
+    q[:, 2] = held_angle
     T = poses_of(arm, q)
-    judged = arm.inverse(T[:, :3, :3], T[:, :3, 3], held)
+    judged = arm.inverse(T[:, :3, :3], T[:, :3, 3], held_angle)
     found = ik.solutions_of_each(T)
     for i, solutions in enumerate(found):
         expected = distinct(judged[i])
@@ -302,7 +302,7 @@ def test_joints_with_room_for_whole_turns_stay_near_the_middle():
 
 
 @pytest.mark.parametrize(
-    ('held', 'message'),
+    ('held_values', 'message'),
     [
         ({}, '7 joints with 0 held leave 7 free'),
         ({2: (0.0,), 3: (0.0,)}, 'leave 5 free'),
@@ -313,9 +313,9 @@ def test_joints_with_room_for_whole_turns_stay_near_the_middle():
         ({3: (0.5,)}, "joint_4 held, robot 'lwr4plus' is singular everywhere"),
     ],
 )
-def test_wrong_held_joints_are_refused(held, message):
+def test_wrong_held_joints_are_refused(held_values, message):
     with pytest.raises(InputError, match=message):
-        InverseKinematics(read_robot('lwr4plus'), held)
+        InverseKinematics(read_robot('lwr4plus'), held_values)
 
 
 # Errors of lengths (m) and tilts (rad) per axis, as calibrations of delivered arms have them and
@@ -328,7 +328,7 @@ def ur10():
 
 
 @pytest.mark.parametrize(
-    ('make', 'errors', 'held', 'way'),
+    ('make', 'errors', 'held_angles', 'way'),
     [
         (ur5e, OF_A_MAKER, {}, 'near closed form'),
         pytest.param(ur10, OF_A_MAKER, {}, 'near closed form', marks=pytest.mark.qualify),
@@ -339,7 +339,7 @@ def ur10():
     ],
 )
 @pytest.mark.parametrize('poses', [12, pytest.param(1000, marks=pytest.mark.qualify)])
-def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, poses):
+def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held_angles, way, poses):
     """Against pinocchio from random starts; of each pose the angles it was made from, too."""
     pytest.importorskip('pinocchio', reason='needs the judge: pip install pin')
     from judges.inverse_kinematics import InverseJudge, apart, with_errors
@@ -349,25 +349,25 @@ def test_arms_without_a_closed_form_keep_all_solutions(make, errors, held, way, 
     description = make()
     urdf = with_errors(description.urdf, *errors, rng)
     chain = SerialChain.from_urdf(urdf, description.base_link, description.tip_link)
-    ik = InverseKinematics(chain, {joint: (value,) for joint, value in held.items()})
+    ik = InverseKinematics(chain, {joint: (value,) for joint, value in held_angles.items()})
     assert ik.method == way
-    judge = InverseJudge(urdf, chain.base_link, chain.tip_link, chain.joint_names, held)
-    free = [joint for joint in range(len(chain)) if joint not in held]
+    judge = InverseJudge(urdf, chain.base_link, chain.tip_link, chain.joint_names, held_angles)
+    free = [joint for joint in range(len(chain)) if joint not in held_angles]
     q = rng.uniform(-np.pi, np.pi, (poses, len(chain)))
-    q[:, list(held)] = list(held.values())
+    q[:, list(held_angles)] = list(held_angles.values())
     T = np.array([judge.tool(row[free]).homogeneous for row in q])
     missed, judge_missed, doubled, total, worst = 0, 0, 0, 0, (0.0, 0.0)
     for row, pose, solutions in zip(q[:, free], T, ik.solutions_of_each(T), strict=True):
         ours = solutions[:, free]
         doubled += sum(np.min(apart(ours[i], ours[:i])) < 1e-4 for i in range(1, len(ours)))
-        left = [judge.left(angles, pose) for angles in ours]
-        worst = tuple(np.maximum(worst, np.max(left, axis=0)))
+        tool_errors = [judge.left(angles, pose) for angles in ours]
+        worst = tuple(np.maximum(worst, np.max(tool_errors, axis=0)))
         # A solution is found with a chance of about an eighth a start: 80 miss 1 in 40,000.
         judged = judge.solutions(pose, 80, rng)
         for angles in np.vstack((row, judged)):
-            near = np.min(apart(angles, ours), initial=np.inf) < 1e-3
-            missed += not near
-            ours = ours if near else np.vstack((ours, angles))
+            is_found = np.min(apart(angles, ours), initial=np.inf) < 1e-3
+            missed += not is_found
+            ours = ours if is_found else np.vstack((ours, angles))
         total += len(ours)
         judge_missed += sum(np.min(apart(a, judged), initial=np.inf) > 1e-3 for a in ours)
     print(
@@ -399,8 +399,8 @@ def test_arms_with_few_or_sliding_joints_keep_all_solutions(joints, slides, pose
     ik = InverseKinematics(chain)
     judge = InverseJudge(urdf, chain.base_link, chain.tip_link, chain.joint_names, {})
 
-    def apart(q, others):
-        gaps = others - q
+    def largest_gaps(q, rows):
+        gaps = rows - q
         return np.max(np.abs(np.where(chain.slides, gaps, wrapped(gaps))), axis=-1)
 
     q = rng.uniform(-3, 3, (poses, joints))
@@ -408,11 +408,11 @@ def test_arms_with_few_or_sliding_joints_keep_all_solutions(joints, slides, pose
     np.testing.assert_allclose(T, chain.forward(q), atol=1e-12)
     missed, total = 0, 0
     for row, pose, ours in zip(q, T, ik.solutions_of_each(T), strict=True):
-        assert all(np.min(apart(ours[i], ours[:i])) > 1e-5 for i in range(1, len(ours)))
+        assert all(np.min(largest_gaps(ours[i], ours[:i])) > 1e-5 for i in range(1, len(ours)))
         assert np.max([judge.left(found, pose) for found in ours]) < 2e-8
-        assert np.min(apart(row, ours)) < 1e-5
+        assert np.min(largest_gaps(row, ours)) < 1e-5
         for found in judge.solutions(pose, 60, rng):
-            missed += np.min(apart(found, ours)) > 1e-3
+            missed += np.min(largest_gaps(found, ours)) > 1e-3
         total += len(ours)
     print(f'of {total} solutions {missed} missed')
     assert missed <= 1e-3 * total
@@ -427,8 +427,8 @@ def test_what_many_starts_miss_is_estimated_by_how_often_each_was_found():
     free, estimated, chances, missed, new, total = list(range(6)), [], [], 0, [], 0
     for q in rng.uniform(-np.pi, np.pi, (60, 6)):
         T = np.broadcast_to(chain.forward(q), (300, 4, 4))
-        found, left = reach_from(chain, free, rng.uniform(-np.pi, np.pi, (300, 6)), T)
-        found = found[left < 1e-8]
+        found, errors = reach_from(chain, free, rng.uniform(-np.pi, np.pi, (300, 6)), T)
+        found = found[errors < 1e-8]
         every, _ = distinct_rows(chain, found)
         few, counts = distinct_rows(chain, found[:12])
         once, twice = int(np.sum(counts == 1)), int(np.sum(counts == 2))

@@ -63,10 +63,10 @@ def test_a_description_of_the_same_arm(change):
 def changed(key, joint, new):
     """Return the description with an attribute of one joint replaced."""
     head, tail = TEXT.split(f'<joint name="{joint}"', 1)
-    body, rest = tail.split('</joint>', 1)
+    body, remainder = tail.split('</joint>', 1)
     body, count = re.subn(rf'{key}="([^"]*)"', f'{key}="{new}"', body, count=1)
     assert count
-    return f'{head}<joint name="{joint}"{body}</joint>{rest}'
+    return f'{head}<joint name="{joint}"{body}</joint>{remainder}'
 
 
 J = CHAIN.joint_names

@@ -127,11 +127,11 @@ def test_positions_for_axes_along_the_coordinate_axes(axis):
 
 def test_a_part_of_the_arm_can_be_the_chain():
     urdf = random_arm_urdf(np.random.default_rng(3))
-    whole = SerialChain.from_urdf(urdf, 'base_link', 'tool')
+    full_chain = SerialChain.from_urdf(urdf, 'base_link', 'tool')
     part = SerialChain.from_urdf(urdf, 'link_2', 'link_5')
     assert part.joint_names == ('joint_3', 'joint_4', 'joint_5')
     q = np.linspace(-1, 1, 6)
-    frames = whole.frames(q)
+    frames = full_chain.frames(q)
     np.testing.assert_allclose(frames[1] @ part.forward(q[2:5]), frames[4], atol=1e-13)
 
 

@@ -51,8 +51,8 @@ def judge(monkeypatch, waypoints, along, start, limits, speeds=None):
         names = ('lower', 'upper', 'velocity', 'acceleration')
         converted = {name: getattr(limits, name) * unit for name in names}
         sliding = dataclasses.replace(limits, units=SLIDES, **converted)
-        others = None if speeds is None else Converted(speeds, unit)
-        said = _judged(monkeypatch, waypoints, along, start, sliding, others, unit)
+        converted_speeds = None if speeds is None else Converted(speeds, unit)
+        said = _judged(monkeypatch, waypoints, along, start, sliding, converted_speeds, unit)
         assert without_figures(said) == without_figures(why)
     return why
 

@@ -305,7 +305,7 @@ def halted(rig, reason, within_s=5.0):
     assert not rig.supervisor.busy
 
 
-def stays_halted(rig, reason, told=1):
+def stays_halted(rig, reason, times=1):
     """Neither plans nor a planner that pauses and runs again end a halt that was told so often."""
     commands = len(rig.commands)
     rig.plan([0.2, 0.1], [0.3, 0.1])
@@ -315,7 +315,7 @@ def stays_halted(rig, reason, told=1):
     rig.run(2.0)
     rig.answer(0)
     assert rig.supervisor.halted == reason
-    assert len(rig.said(Halted)) == told
+    assert len(rig.said(Halted)) == times
     assert len(rig.commands) == commands
 
 

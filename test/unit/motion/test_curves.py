@@ -121,9 +121,9 @@ def rates(waypoints):
 def test_a_curve_and_each_of_its_stops_keep_the_limits_and_stay_on_it(seed):
     curve, _ = drawn(seed)
     motion = Curve.within(SEVEN, curve)
-    whole = [Waypoint(0.0, curve.start, np.zeros(7)), *motion.waypoints()]
+    full_path = [Waypoint(0.0, curve.start, np.zeros(7)), *motion.waypoints()]
     trajectory = Trajectory((motion,))
-    ways = [whole]
+    ways = [full_path]
     for sent_s in np.linspace(JOINED_S, motion.duration_s - 0.01, 53):
         piece = stop_of(trajectory, sent_s, sent_s + STOP_AHEAD_S)
         assert piece.end_s <= sent_s + STOP_AHEAD_S + RAMP_S + 1e-9
@@ -139,7 +139,7 @@ def test_a_curve_and_each_of_its_stops_keep_the_limits_and_stay_on_it(seed):
             assert np.max(np.abs(off)) < 1e-6
     # It is as fast as they allow: by one of them, everywhere on the way, or by its ends.
     fastest = max(
-        np.max(rates(whole)[0] / SEVEN.velocity),
+        np.max(rates(full_path)[0] / SEVEN.velocity),
         np.max([rates(way)[1] for way in ways] / SEVEN.acceleration),
         motion.rate * 0.9 / curve.straight_until,
         motion.rate * RAMP_S / (1.0 - curve.straight_from),

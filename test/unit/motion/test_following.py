@@ -254,7 +254,7 @@ def late(t):
     return LINE.start + LINE.share(t - 0.1)[0] * LINE.way
 
 
-def beside(off_rad, when=lambda t: t > 0.0):
+def stray_way(off_rad, when=lambda t: t > 0.0):
     """Return the way of an arm that lags by 0.1 s and is off its line at some times."""
     return lambda t: late(t) + [0.0, off_rad * when(t)]
 
@@ -263,11 +263,11 @@ def beside(off_rad, when=lambda t: t > 0.0):
     ('where', 'until_s', 'astray_s', 'said'),
     [
         # A bump, and two of them, which are not added.
-        (beside(0.03, lambda t: 1.0 < t < 1.25), 2.4, None, ''),
-        (beside(0.03, lambda t: 1.0 < t < 1.2 or 1.3 < t < 1.55), 2.4, None, ''),
-        (beside(0.03, lambda t: t > 1.0), 2.4, 1.0 + ASTRAY_S, BESIDE),
-        (beside(0.95 * ON_PATH_RAD), 2.4, None, ''),
-        (beside(1.05 * ON_PATH_RAD), 2.4, ASTRAY_S, BESIDE.replace('1.7', '1.2')),
+        (stray_way(0.03, lambda t: 1.0 < t < 1.25), 2.4, None, ''),
+        (stray_way(0.03, lambda t: 1.0 < t < 1.2 or 1.3 < t < 1.55), 2.4, None, ''),
+        (stray_way(0.03, lambda t: t > 1.0), 2.4, 1.0 + ASTRAY_S, BESIDE),
+        (stray_way(0.95 * ON_PATH_RAD), 2.4, None, ''),
+        (stray_way(1.05 * ON_PATH_RAD), 2.4, ASTRAY_S, BESIDE.replace('1.7', '1.2')),
         # An arm that stays 15 mrad short has a lag of seconds, and is near all the same.
         (lambda t: np.minimum(late(t), [1.235, 0.0]), 6.0, None, ''),
         (lambda t: late(min(t, 1.0)), 4.0, 1.35 + ASTRAY_S, STOPPED_ON_ITS_WAY),
@@ -283,7 +283,7 @@ def test_when_an_arm_is_astray(where, until_s, astray_s, said):
 
 def test_an_arm_is_lost_before_it_is_astray():
     arm = Arm()
-    assert arm.run(1.1, beside(0.03, lambda t: t > 1.0)) is None
+    assert arm.run(1.1, stray_way(0.03, lambda t: t > 1.0)) is None
     assert arm.lost == BESIDE
     arm = Arm()
     assert arm.run(0.44, lambda t: LINE.start) is None

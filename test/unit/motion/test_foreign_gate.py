@@ -73,7 +73,7 @@ def test_it_passes_what_keeps_the_limits_and_nothing_else(is_straight, moves):
             assert done.is_straight == is_straight
             passed += 1
             continue
-        (name,) = [one for one in refused if one in said]
+        (name,) = [reason for reason in refused if reason in said]
         assert worst[name] > 1.0, (worst, said)
         refused[name] += 1
     assert passed > 50

@@ -177,8 +177,8 @@ def test_what_a_controller_by_action_keeps():
 
 def test_a_way_out_is_told_in_the_units_of_its_joints():
     out = FreePath(np.array([AT, AT + [0.012, 0.1]]), way_out=True)
-    told = MoveQueue().offer(PathAnswer(None, 'the floor', at_start=True, way_out=out), LIMITS)
-    assert told.endswith('rail by 12.0 mm, a by 5.7 deg')
+    text = MoveQueue().offer(PathAnswer(None, 'the floor', at_start=True, way_out=out), LIMITS)
+    assert text.endswith('rail by 12.0 mm, a by 5.7 deg')
 
 
 def test_rules_of_another_arm_are_refused():

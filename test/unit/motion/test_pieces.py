@@ -43,13 +43,13 @@ def test_a_piece_is_the_trajectory_up_to_its_stop_and_ends_soon(points):
         piece = piece_of(trajectory, sent_s, HORIZON_S)
         assert piece.end_s <= sent_s + HORIZON_S + 1e-9 or piece.is_last
         assert piece.end_s <= max(sent_s + HORIZON_S, trajectory.duration_s)
-        first, *rest = piece.waypoints
+        first, *further_waypoints = piece.waypoints
         if sent_s > RAMP_S + PAST_S:
             assert first.time_s == pytest.approx(sent_s - PAST_S)
         elif sent_s > RAMP_S + LEAST_PAST_S:
             assert first.time_s == pytest.approx(RAMP_S)
         assert np.all(piece.waypoints[-1].velocity == 0.0)
-        for before, after in zip([first, *rest], rest):
+        for before, after in zip([first, *further_waypoints], further_waypoints):
             cubic = Cubic.between(before, after)
             for share in np.linspace(0.0, 1.0, 7):
                 at_s = before.time_s + share * cubic.duration_s
@@ -100,17 +100,17 @@ def moved(rules, **events):
 
 
 def test_no_renewal_is_seen_in_the_path_that_is_followed():
-    _, whole = moved(RULES)
+    _, full_path = moved(RULES)
     rig, pieces = moved(IN_PIECES)
     assert len(rig.said(Renew)) > 5
     assert len(rig.said(Drive)) == 1
     assert not rig.said(Stop, Halted, Failed)
     # It begins a moment later: the same function of time from the end of its first ramp on.
     shift = round(AHEAD_S / 0.02)
-    whole, pieces = whole[60:, 1:], pieces[60 + shift :, 1:]
-    count = min(len(whole), len(pieces))
+    full_path, pieces = full_path[60:, 1:], pieces[60 + shift :, 1:]
+    count = min(len(full_path), len(pieces))
     assert count > 200
-    assert np.max(np.abs(whole[:count] - pieces[:count])) <= 1e-4
+    assert np.max(np.abs(full_path[:count] - pieces[:count])) <= 1e-4
     # No controller ever has more than the horizon.
     for t, _, _, points in rig.commands:
         begins_s = rig.said(Drive)[0].begins_s

@@ -61,8 +61,8 @@ def test_a_sensor_that_cannot_measure_says_why(change, finding):
     assert preflight(facts) == (finding,)
     # Where one of two is enough, the other one may measure.
     assert preflight(replace(facts, any_sensor=True)) == ()
-    alone = replace(facts, any_sensor=True, sensors=(replace(MOCAP, **change),))
-    assert preflight(alone) == (finding,)
+    single_facts = replace(facts, any_sensor=True, sensors=(replace(MOCAP, **change),))
+    assert preflight(single_facts) == (finding,)
 
 
 def test_exactly_three_seconds_are_fresh():

@@ -63,7 +63,7 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
 
 
 @pytest.mark.parametrize(
-    ('own', 'rival', 'uptime_s', 'ends'),
+    ('identity', 'rival', 'uptime_s', 'ends'),
     [
         # At the difference up to which the identities decide, and at that which decides alone.
         ('2', '1', 2.5, True),
@@ -75,8 +75,8 @@ def test_a_rival_before_it_has_heard_itself_does_not_count_as_listening():
         ('1', '1', 1.0, False),
     ],
 )
-def test_differences_that_are_the_bounds_themselves(own, rival, uptime_s, ends):
-    node = DuplicateNodeCheck(own)
+def test_differences_that_are_the_bounds_themselves(identity, rival, uptime_s, ends):
+    node = DuplicateNodeCheck(identity)
     node.update_own(0.0)
     # Both have been running for two seconds more.
     assert not node.update_other(rival, 2.0 + uptime_s - 0.5, 2.5, 2.5)

@@ -16,9 +16,9 @@ def feed(detector, times, positions):
     return [detector.update(t, np.array(q)) for t, q in zip(times, positions)]
 
 
-def at_100(beside):
+def at_100(distance):
     """Return a way that has one report elsewhere, two seconds after the first."""
-    return np.where(np.arange(len(TIMES)) == 100, beside, 0.0)
+    return np.where(np.arange(len(TIMES)) == 100, distance, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,10 @@ EXACT = SettleRules(
 AT = np.array([0.5, -1.0])
 
 
-def states_at(stamps, beside=None):
-    """States of a new detector; beside: distance of joint 1 from the target in each report."""
-    beside = np.zeros(len(stamps)) if beside is None else np.array(beside)
-    q = AT + np.outer(beside, [1.0, 0.0])
+def states_at(stamps, distances=None):
+    """States of a new detector; distances: of joint 1 from the target in each report."""
+    distances = np.zeros(len(stamps)) if distances is None else np.array(distances)
+    q = AT + np.outer(distances, [1.0, 0.0])
     return feed(SettleDetector(AT, EXACT), stamps, q)
 
 
@@ -72,8 +72,8 @@ def test_it_has_settled_when_the_time_is_over_and_not_before():
 
 
 def test_elsewhere_is_said_when_the_time_is_over_and_moving_before():
-    away = 2.0**-7
-    assert states_at([8.0, 8.5, 8.75, 9.0], [away] * 4) == [
+    distance = 2.0**-7
+    assert states_at([8.0, 8.5, 8.75, 9.0], [distance] * 4) == [
         'moving',
         'moving',
         'moving',

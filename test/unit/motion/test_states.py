@@ -251,12 +251,12 @@ def rows(monkeypatch):
 
     def recorded(supervisor, event, *actions):
         before = supervisor.state
-        left = step(supervisor, event, *actions)
+        actions_left = step(supervisor, event, *actions)
         then = ARM[before][event]
         assert supervisor.state is then.state
-        assert tuple(map(type, left)) == then.actions
+        assert tuple(map(type, actions_left)) == then.actions
         used.add((before, event))
-        return left
+        return actions_left
 
     monkeypatch.setattr(arm_supervisor.ArmSupervisor, '_step', recorded)
     return used

@@ -166,9 +166,9 @@ def test_a_polyline_is_left_to_rest_at_each_corner():
     assert times[-1] == pytest.approx(trajectory.duration_s)
     curve = curve_of(points[0], waypoints)
     for corner, begun_s, duration_s in zip(points[1:-1], trajectory.starts_s, durations):
-        rest = np.linspace(begun_s + duration_s, begun_s + duration_s + REST_S, 11)
-        np.testing.assert_allclose(curve(rest), np.broadcast_to(corner, (11, 2)), atol=1e-12)
-        np.testing.assert_allclose(curve(rest, 1), 0.0, atol=1e-12)
+        rest_times = np.linspace(begun_s + duration_s, begun_s + duration_s + REST_S, 11)
+        np.testing.assert_allclose(curve(rest_times), np.broadcast_to(corner, (11, 2)), atol=1e-12)
+        np.testing.assert_allclose(curve(rest_times, 1), 0.0, atol=1e-12)
     # `at` gives the same as the judge, rests included; before and after it stands at its ends.
     for time_s in np.linspace(0.0, trajectory.duration_s, 501):
         q, velocity = trajectory.at(time_s)

@@ -85,11 +85,11 @@ def test_an_arm_that_stops_as_ever_goes_on(noise, sag):
 
 
 @pytest.mark.parametrize(
-    ('seconds', 'released', 'alone'),
+    ('seconds', 'released', 'goes_on'),
     [(4.0, None, True), (7.0, None, False), (7.0, 'always', True), (7.0, 'lately', False)],
 )
 @pytest.mark.parametrize('place', ['moving', 'settled'])
-def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
+def test_who_goes_on_after_an_interruption(seconds, released, goes_on, place):
     """A person, unless the robot reported all the time that nobody has stopped it."""
     rig = begun()
     if released == 'always':
@@ -109,9 +109,9 @@ def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
         rig.answer(0)
     count = len(rig.said(Drive))
     rig.run(4.0)
-    assert (len(rig.said(Drive)) > count) == alone
+    assert (len(rig.said(Drive)) > count) == goes_on
     assert not rig.said(Halted)
-    if alone:
+    if goes_on:
         return
     assert rig.supervisor.blocked(rig.wall) == (
         'the collection was interrupted for more than 5 s (waiting for mocap): '
@@ -128,7 +128,7 @@ def test_who_goes_on_after_an_interruption(seconds, released, alone, place):
 @pytest.mark.parametrize('topic', [False, True])
 def test_a_bridge_that_was_away_for_long_waits_for_a_person(topic):
     """Also where the robot says now that it is released: nobody listened meanwhile."""
-    for gone_s, alone in ((3.0, True), (20.0, False)):
+    for gone_s, goes_on in ((3.0, True), (20.0, False)):
         rig = Rig(begun=False)
         rig.supervisor.interrupted(rig.wall - gone_s)
         if topic:
@@ -136,7 +136,7 @@ def test_a_bridge_that_was_away_for_long_waits_for_a_person(topic):
             rig.do(rig.supervisor.observe('safety_link', '', rig.wall))
         rig.plan([0.3, 0.0])
         rig.run(4.0)
-        assert bool(rig.said(Drive)) == alone
+        assert bool(rig.said(Drive)) == goes_on
 
 
 def test_frozen_reports_and_a_person_who_clears_the_halt():

@@ -61,8 +61,8 @@ STEP_S = 0.02
 class LogBook:
     """A node's logger that keeps what is written, and else is the node's own."""
 
-    def __init__(self, own, lines):
-        self._own, self._lines = own, lines
+    def __init__(self, name, lines):
+        self._own, self._lines = name, lines
 
     def __getattr__(self, name):
         if name not in ('info', 'warning', 'error'):
@@ -245,7 +245,9 @@ class Rig:
         ours = (self.states, self.said, self.solutions, self.ways)
         topics = {publisher.topic_name for publisher in ours}
         # Both sides of a match: what is sent before the other one has seen it may be lost.
-        heard = [one for one in self.bridge.subscriptions if one.topic_name in topics]
+        heard = [
+            listener for listener in self.bridge.subscriptions if listener.topic_name in topics
+        ]
         assert len(heard) >= len(ours)
         self.wait(
             lambda: (
@@ -448,13 +450,15 @@ class Rig:
         self.bridge.status.publish()
         level, message, values, state = self.bridge.summarised
         shown = {**status.pairs(state), **{key: str(value) for key, value in values.items()}}
-        told = level, message, shown
+        expected = level, message, shown
 
         def has_come():
             # An older one may still be on its way.
-            level, message, values = self.summaries[-1] if len(self.summaries) > count else told
-            same = {key: values.get(key) for key in told[2]} == told[2]
-            return len(self.summaries) > count and (level, message) == told[:2] and same
+            level, message, values = (
+                self.summaries[-1] if len(self.summaries) > count else expected
+            )
+            same = {key: values.get(key) for key in expected[2]} == expected[2]
+            return len(self.summaries) > count and (level, message) == expected[:2] and same
 
         self.wait(has_come, 'a summary')
         return self.summaries[-1]

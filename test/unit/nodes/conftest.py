@@ -16,8 +16,8 @@ def rig(monkeypatch, tmp_path):
         return made[-1].ready() if ready else made[-1]
 
     yield make
-    for one in made:
-        one.close()
+    for made_rig in made:
+        made_rig.close()
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def compensator(monkeypatch, tmp_path):
 
     yield make
     try:
-        for one in made:
-            one.close()
+        for made_rig in made:
+            made_rig.close()
     finally:
         rclpy.try_shutdown()

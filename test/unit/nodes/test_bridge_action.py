@@ -102,8 +102,8 @@ def rig(monkeypatch, tmp_path):
         return made[-1].ready() if ready else made[-1]
 
     yield make
-    for one in made:
-        one.close()
+    for made_rig in made:
+        made_rig.close()
 
 
 def obeyed_point(q, seconds):
@@ -336,10 +336,10 @@ def test_the_end_of_the_bridge_stops_an_arm_on_its_way(rig):
     assert is_stop(r.controller.goals[-1])
 
 
-def spun_with(own, other):
+def spun_with(original, other):
     def spin(**how):
         other(timeout_sec=0.0)
-        own(**how)
+        original(**how)
 
     return spin
 

@@ -129,17 +129,17 @@ def test_an_emergency_stop_of_an_arm_that_rests_begins_nothing_when_it_is_releas
     assert r.halted() or r.summary()[2]['asks_for_collect'] or state == 'paused'
 
 
-@pytest.mark.parametrize(('gone_s', 'alone'), [(2.0, True), (60.0, False)])
-def test_a_bridge_that_was_away_in_a_run_for_long_waits_for_a_person(rig, gone_s, alone):
+@pytest.mark.parametrize(('gone_s', 'goes_on'), [(2.0, True), (60.0, False)])
+def test_a_bridge_that_was_away_in_a_run_for_long_waits_for_a_person(rig, gone_s, goes_on):
     r = rig(ready=False)
     r.end_bridge()
     commands_file(r).write(HOME, r.time_ns() - round(gone_s * 1e9))
     r._open_bridge({})
-    r.ready() if alone else r.alone()
+    r.ready() if goes_on else r.alone()
     r.plan(TARGET)
     r.run(4.0)
-    assert bool(r.bridge.published) == alone
-    if not alone:
+    assert bool(r.bridge.published) == goes_on
+    if not goes_on:
         r.bridge._watch()
         collect(r)
         r.run(5.0, lambda: r.bridge.published)

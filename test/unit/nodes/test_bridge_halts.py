@@ -101,12 +101,12 @@ def test_a_gripper_may_publish_its_own_joints(rig, intruder):
     r.wait(listed(r.bridge, 'joint_states', 2), 'the gripper')
     r.wait(gripper.get_subscription_count, 'the match')
 
-    def beside(message):
+    def publish_gripper(message):
         # Its clock and its numbers are its own.
         r.taken(gripper, JointState(name=['finger'], position=[0.01]), 'states')
         return message
 
-    r.alter = beside
+    r.alter = publish_gripper
     r.settle(AWAY)
     assert not r.halted()
     assert not r.bridge.supervisor.reports.refused

@@ -84,7 +84,10 @@ def test_the_description_of_the_arm_with_a_gripper_is_welcome(rig):
         '<child link="hand"/></joint></robot>'
     )
     taken = []
-    r.bridge._on_description, own = lambda m: taken.append(own(m)), r.bridge._on_description
+    r.bridge._on_description, original = (
+        lambda m: taken.append(original(m)),
+        r.bridge._on_description,
+    )
     publisher = r.peer.create_publisher(String, 'robot_description', LATCHED)
     publisher.publish(String(data=CELL.urdf_text.replace('</robot>', gripper)))
     r.alone()

@@ -41,8 +41,8 @@ def pieces(request, rig, monkeypatch, tmp_path):
         return made[-1].ready()
 
     yield make
-    for one in made:
-        one.close()
+    for made_rig in made:
+        made_rig.close()
 
 
 def on_one_clock(r):
@@ -63,12 +63,12 @@ def test_a_long_move_comes_in_pieces_and_ends_where_it_was_to(pieces, stamps):
     assert not r.halted()
     assert r.bridge.counts['commanded'] == 1
     assert r.bridge.counts['stopped'] == 0
-    sent = [one for one in r.commands if np.max(np.abs(one.q - HOME)) > 1e-4]
+    sent = [command for command in r.commands if np.max(np.abs(command.q - HOME)) > 1e-4]
     assert len(sent) > (4 if stamps == 'kept' else 2)
-    assert all((one.begins_s is not None) == (stamps == 'kept') for one in sent)
-    for one in sent:
-        assert one.end_s - one.arrival_s <= 1.6 + 0.15
-        assert np.all(one.v[-1] == 0.0)
+    assert all((command.begins_s is not None) == (stamps == 'kept') for command in sent)
+    for command in sent:
+        assert command.end_s - command.arrival_s <= 1.6 + 0.15
+        assert np.all(command.v[-1] == 0.0)
     if isinstance(r, ActionRig):
         assert r.controller.cancelled == 0
     off = np.array([q for _, q, _ in r.arm.history])[:, 1:] - HOME[1:]
@@ -77,12 +77,12 @@ def test_a_long_move_comes_in_pieces_and_ends_where_it_was_to(pieces, stamps):
 
 def motion_left_s(arm, now_s):
     """Return how long the arm goes on by what its controller has, s."""
-    alone = copy.copy(arm)
-    alone.history, alone.lock = deque(arm.history), threading.RLock()
+    arm_copy = copy.copy(arm)
+    arm_copy.history, arm_copy.lock = deque(arm.history), threading.RLock()
     last_s = now_s
     for t in np.arange(now_s, now_s + 5.0, 0.01):
-        alone.advance(t)
-        last_s = t if alone.speed() > STANDS_RAD_S else last_s
+        arm_copy.advance(t)
+        last_s = t if arm_copy.speed() > STANDS_RAD_S else last_s
     return last_s - now_s
 
 
@@ -223,5 +223,5 @@ def test_stamps_of_another_clock_are_not_used(rig):
     r = rig(**PIECES, trajectory_stamps='kept')
     r.plan(AWAY)
     r.run(30.0, lambda: r.settled)
-    assert all(one.begins_s is None for one in r.commands)
+    assert all(command.begins_s is None for command in r.commands)
     assert len(r.commands) > 3

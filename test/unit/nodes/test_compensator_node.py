@@ -67,46 +67,46 @@ def test_a_planner_of_the_nominal_arm_moves_the_true_one(rig):
     other = []
     r.peer.create_subscription(JointState, 'compensator/joint_states', other.append, 10)
     r.joint_states.publish(JointState(name=['finger'], position=[0.01]))
-    assert r.run(5.0, lambda: any(list(one.name) == ['finger'] for one in other))
+    assert r.run(5.0, lambda: any(list(joint_state.name) == ['finger'] for joint_state in other))
     assert r.states[-1] == {'correction': 'on', 'sha256': r.node._correction.sha256, 'why': ''}
 
 
 def test_what_is_refused_has_its_reason(rig):
     r = rig().ready()
-    told = r.told[-1]
+    angles = r.told[-1]
     assert "must read this node's joint_states" in r.refused(r.plan(HOME, TARGET))
-    assert 'its joints are' in r.refused(r.plan(told, TARGET, names=['x', *NAMES[1:]]))
-    broken = r.plan(told, TARGET)
+    assert 'its joints are' in r.refused(r.plan(angles, TARGET, names=['x', *NAMES[1:]]))
+    broken = r.plan(angles, TARGET)
     broken.points[3].velocities = []
     assert 'give all or none' in r.refused(broken)
     broken.points[3].positions = broken.points[3].positions[:3]
     assert 'not a position' in r.refused(broken)
-    later = r.plan(told, TARGET)
+    later = r.plan(angles, TARGET)
     later.header.stamp = stamp_of(time.time() + 5.0)
     assert 'from now: give none' in r.refused(later)
     # Somebody who sends past it.
     rival = r.peer.create_publisher(JointTrajectory, f'{CONTROLLER}/joint_trajectory', 10)
     assert r.run(PATIENCE_S, lambda: '2 publishers' in r.node._trouble())
-    assert '2 publishers' in r.refused(r.plan(told, TARGET))
+    assert '2 publishers' in r.refused(r.plan(angles, TARGET))
     r.peer.destroy_publisher(rival)
     assert r.run(PATIENCE_S, lambda: not r.node._trouble())
     # A description that has the correction in it, another arm's, and then the nominal one again.
-    one = form_content(read_compensation(r.file), 'urdf', np.random.default_rng(1))
-    urdf = exported(read_compensation(r.file), 'urdf', one)['robot_calibrated.urdf']
+    content = form_content(read_compensation(r.file), 'urdf', np.random.default_rng(1))
+    urdf = exported(read_compensation(r.file), 'urdf', content)['robot_calibrated.urdf']
     for text, words in (
         (urdf, 'holds this correction already'),
         (URDF.replace('xyz="0 0 0.2085"', 'xyz="0 0 0.25"'), 'is of another URDF than'),
     ):
         r.description.publish(String(data=text))
         assert r.run(PATIENCE_S, lambda words=words: words in r.node._trouble()), r.node._trouble()
-        assert words in r.refused(r.plan(told, TARGET))
+        assert words in r.refused(r.plan(angles, TARGET))
     assert r.run(5.0, lambda: 'another URDF' in r.states[-1]['why'])
     r.description.publish(String(data=URDF))
     assert r.run(PATIENCE_S, lambda: not r.node._trouble())
     # Joints that nobody reports any more.
     r.due = np.inf
     r.run(0.4)
-    assert 'joint_states does not come' in r.refused(r.plan(told, TARGET))
+    assert 'joint_states does not come' in r.refused(r.plan(angles, TARGET))
 
 
 def test_it_is_switched_while_the_arm_stands_alone(rig, tmp_path):
@@ -232,13 +232,13 @@ def test_what_is_worked_out_keeps_nothing_waiting(rig, monkeypatch):
     """An empty trajectory holds the arm at once, and what is worked out is not passed on."""
     r = rig().ready()
     begun, go_on = threading.Event(), threading.Event()
-    own = r.node._motion.corrected_for_controller
+    original = r.node._motion.corrected_for_controller
 
-    def slow(wanted, *rest):
+    def slow(wanted, *arguments):
         if len(wanted.times_s):
             begun.set()
             assert go_on.wait(PATIENCE_S)
-        return own(wanted, *rest)
+        return original(wanted, *arguments)
 
     monkeypatch.setattr(r.node._motion, 'corrected_for_controller', slow)
     said = []
@@ -259,7 +259,7 @@ def test_what_is_worked_out_keeps_nothing_waiting(rig, monkeypatch):
     [
         (lambda m: setattr(m.points[-1].time_from_start, 'sec', 2**31 - 1), 'are the most'),
         (
-            lambda m: [setattr(one, 'velocities', []) for one in m.points],
+            lambda m: [setattr(waypoint, 'velocities', []) for waypoint in m.points],
             'step of its speed',
         ),
     ],
@@ -291,7 +291,7 @@ class ByAction:
     def is_found(self):
         """Whether each side has found the other's server."""
         found = self.client.server_is_ready, self.r.node._client.server_is_ready
-        return all(self.r.run(0.5 * PATIENCE_S, one) for one in found)
+        return all(self.r.run(0.5 * PATIENCE_S, condition) for condition in found)
 
     def hold(self):
         self.r.drive = None

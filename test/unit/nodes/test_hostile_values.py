@@ -47,7 +47,7 @@ SAMPLE = 12
 """So many values of each message are tried at every run; all of them in the campaigns."""
 
 
-def whole(request):
+def is_exhaustive(request):
     """Whether all values are to be tried."""
     return 'qualify' in {mark.name for mark in request.node.iter_markers()}
 
@@ -61,8 +61,8 @@ def joint_state(prefix=''):
 
 def trajectory():
     message = JointTrajectory(joint_names=NAMES, points=[point(HOME, 1), point(TARGET, 2)])
-    for one in message.points:
-        one.velocities = [0.0] * len(NAMES)
+    for waypoint in message.points:
+        waypoint.velocities = [0.0] * len(NAMES)
     message.header.stamp = stamp(1.0)
     return message
 
@@ -97,7 +97,7 @@ def messages(subscription, most, rng):
     kind = subscription.msg_type
     if kind is String:
         texts = [*records(), CELL.urdf_text] if most is None else [rng.choice(records())]
-        return [one for text in texts for one in spoilt_text(text, most, rng)]
+        return [message for text in texts for message in spoilt_text(text, most, rng)]
     return spoilt(VALID.get(kind, kind)(), most, rng)
 
 
@@ -178,12 +178,15 @@ class Attack:
             if self.most is not None:
                 live = ('speed_share', 'cartesian_speed_limit_m_s')
                 names = [*(name for name in live if name in names), *names[-2:]]
-            return [kind.Request(parameters=[one]) for one in spoilt_parameters(names)]
+            return [kind.Request(parameters=[parameter]) for parameter in spoilt_parameters(names)]
         return spoilt(kind.Request(), self.most, self.rng)
 
     def check(self):
         print(f'{self.node.get_name()}: {self.sent} values')
-        found = [*self.faults, *(one for one in self.node._faults if one.startswith('a fault'))]
+        found = [
+            *self.faults,
+            *(fault for fault in self.node._faults if fault.startswith('a fault')),
+        ]
         assert not found, f'{len(found)}: ' + '\n'.join(found[:20])
         assert self.node.failure is None
 
@@ -286,12 +289,12 @@ def test_a_fault_of_the_compensator_stops_the_arm_until_a_person_enables_it(comp
     def broken(*args):
         raise KeyError('unforeseen')
 
-    own, r.node._states.take = r.node._states.take, broken
+    original, r.node._states.take = r.node._states.take, broken
     # What the test's executor would raise goes to the node, as in its process.
     spin = r.own.spin_once
     r.own.spin_once = lambda timeout_sec: spin_once_of(spin, r.node, timeout_sec)
     assert r.run(60.0, lambda: r.node._halted)
-    r.node._states.take = own
+    r.node._states.take = original
     assert r.run(20.0, lambda: len(r.came) > sent)
     (stop,) = r.came[-1].points
     assert not any(stop.velocities)
@@ -416,7 +419,7 @@ def test_a_command_that_cannot_be_published_is_none(rig):
     def full(*how):
         raise OverflowError('it does not fit')
 
-    r.bridge._publish, own = full, r.bridge._publish
+    r.bridge._publish, original = full, r.bridge._publish
 
     def go():
         r.plan(TARGET)
@@ -424,7 +427,7 @@ def test_a_command_that_cannot_be_published_is_none(rig):
 
     with pytest.raises(OverflowError):
         go()
-    r.bridge._publish = own
+    r.bridge._publish = original
     assert r.bridge.supervisor.state in (Arm.STANDS, Arm.ASKS)
     r.bridge.on_fault(OverflowError('it does not fit'))
     assert 'OverflowError: it does not fit' in r.halted()

@@ -29,7 +29,7 @@ def test_an_unknown_node_is_refused_with_the_one_that_was_meant(capsys):
 
 
 @pytest.mark.parametrize(
-    ('others', 'late'),
+    ('excluded_nodes', 'late'),
     [
         # A third of the time until nine nodes are there went into libraries for fits and figures.
         (('watch',), ('scipy.stats', 'scipy.optimize', 'scipy.interpolate', 'matplotlib')),
@@ -43,11 +43,11 @@ def test_an_unknown_node_is_refused_with_the_one_that_was_meant(capsys):
         ),
     ],
 )
-def test_what_a_node_may_never_need_is_not_loaded_when_it_starts(others, late):
+def test_what_a_node_may_never_need_is_not_loaded_when_it_starts(excluded_nodes, late):
     pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
     code = (
         'import importlib, sys\n'
-        f'for name in {[name for name in NODES if name not in others]}: '
+        f'for name in {[name for name in NODES if name not in excluded_nodes]}: '
         'importlib.import_module(f"remaster_ros.nodes.{name}")\n'
         f'print([name for name in {late} if name in sys.modules])'
     )

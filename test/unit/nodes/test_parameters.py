@@ -36,8 +36,8 @@ def test_every_module_with_a_main_is_an_executable_with_parameters():
     for node in NODES:
         assert fields_of(node)
     for kind in DRIVERS:
-        own = load_driver(kind).parameters_type
-        assert list(parameter_fields(own))[:3] == list(parameter_fields(SensorParameters))
+        driver_type = load_driver(kind).parameters_type
+        assert list(parameter_fields(driver_type))[:3] == list(parameter_fields(SensorParameters))
 
 
 @pytest.mark.parametrize('node', NODES)

@@ -90,9 +90,9 @@ def test_no_file_has_a_character_that_a_shell_or_a_page_takes_for_another():
     pages = [page_name(7, name) for name in names]
     assert len(set(pages)) == len(names)
     assert all(re.fullmatch(r'[A-Za-z0-9_.]+', page) for page in pages)
-    held = NameLock(233, '/left/test_naming')
-    assert re.fullmatch(r'[A-Za-z0-9_.]+', held.path.name)
-    held.release()
+    lock = NameLock(233, '/left/test_naming')
+    assert re.fullmatch(r'[A-Za-z0-9_.]+', lock.path.name)
+    lock.release()
     folder = default_folder('/left/cell')
     assert re.fullmatch(r'[A-Za-z0-9_.]+', folder.name)
     assert folder != default_folder('/left_cell')

@@ -108,4 +108,4 @@ def test_of_a_camera_on_the_tool_the_frame_that_stands_is_its_board(node, monkey
     markers = RvizMarkers(node, SCENE, publish_tf=True, on_tool=['camera'])
     markers.place_sensors({'mocap': T_R_N, 'camera': T_R_N})
     sent = node.topics['/tf_static'][-1].transforms
-    assert [one.child_frame_id for one in sent] == ['mocap', 'camera_board']
+    assert [transform.child_frame_id for transform in sent] == ['mocap', 'camera_board']

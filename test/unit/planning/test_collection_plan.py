@@ -59,15 +59,15 @@ LATIN = 'latin_hypercube'
 
 
 def test_a_cell_has_by_default_designed_poses_each_in_all_its_free_solutions_nearest_first():
-    _, whole = latin()
+    _, full_plan = latin()
     scene, plan = planned(PoseSettings())
     assert plan.design_result.reached
-    assert plan.joint_rms <= max(whole.joint_rms, ENOUGH_RAD)
-    assert plan.robot_time_s < whole.robot_time_s
+    assert plan.joint_rms <= max(full_plan.joint_rms, ENOUGH_RAD)
+    assert plan.robot_time_s < full_plan.robot_time_s
     fitted, held_out = of(plan, 'optimization'), of(plan, 'validation')
     assert len({visit.pose for visit in fitted}) >= Floors().poses
     assert len({visit.pose for visit in held_out}) == min(
-        HELD_OUT_POSES, whole.tour.poses['validation']
+        HELD_OUT_POSES, full_plan.tour.poses['validation']
     )
     ways = scene.inverse_kinematics
     limits = scene.model.chain.velocity_limits
@@ -97,19 +97,19 @@ def stops(plan):
 
 
 def test_chosen_solutions_reach_what_all_poses_reach_in_the_fewest_minutes_on_free_ways():
-    _, whole = latin()
-    stated = np.degrees(whole.joint_rms)
+    _, full_plan = latin()
+    stated = np.degrees(full_plan.joint_rms)
     assert stated < np.degrees(ENOUGH_RAD)
     poses = PoseSettings(solutions='chosen', order='fastest', joint_std_deg=stated)
     scene, plan = planned(poses)
-    assert plan.joint_rms <= whole.joint_rms
-    assert plan.robot_time_s < 0.7 * whole.robot_time_s
+    assert plan.joint_rms <= full_plan.joint_rms
+    assert plan.robot_time_s < 0.7 * full_plan.robot_time_s
     fitted, held_out = of(plan, 'optimization'), of(plan, 'validation')
     poses = [visit.pose for visit in fitted]
     assert Floors().hold(np.array(poses))
-    assert len(fitted) < len(of(whole, 'optimization'))
+    assert len(fitted) < len(of(full_plan, 'optimization'))
     assert len({visit.pose for visit in held_out}) == min(
-        HELD_OUT_POSES, whole.tour.poses['validation']
+        HELD_OUT_POSES, full_plan.tour.poses['validation']
     )
     assert max(np.bincount([visit.pose for visit in held_out])) <= HELD_OUT_SOLUTIONS
     for visit in plan.visits:
@@ -136,12 +136,12 @@ def test_more_poses_are_drawn_where_too_few_can_be_taken_for_the_registration():
     tour = planner.registration()
     assert sum(tour.poses.values()) >= 3
     again, _ = planner_of(PoseSettings(), registration=1)
-    for one, other in zip(
+    for pose, other in zip(
         tour.plans['registration'].poses,
         again.registration().plans['registration'].poses,
         strict=True,
     ):
-        np.testing.assert_array_equal(one.T_R_T, other.T_R_T)
+        np.testing.assert_array_equal(pose.T_R_T, other.T_R_T)
 
 
 @pytest.mark.qualify
@@ -222,7 +222,7 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
     planner = TourPlanner(scene, counts, 0, 5, cell.design_settings())
     start = np.deg2rad([5.0, 7.0, 0.0, 112.0, 10.0, 35.0, -20.0])
     tour = planner.collection(planner.rough_places)
-    whole = look_ahead(planner, planner.rough_places, [tour], start)
+    full_forecast = look_ahead(planner, planner.rough_places, [tour], start)
     assert tour.visited == 0
     visited = []
     stop = tour.next(start)
@@ -230,15 +230,17 @@ def test_looking_ahead_leaves_a_tour_as_it_is_and_begins_with_what_is_left_of_it
         visited.append(stop)
         stop = tour.next(stop.solutions[-1])
     # The last one is under way, with its first solution measured.
-    here, rest = stop.solutions[0], tour.with_route(stop, stop.ids[1:])
-    done = sum(len(one.ids) for one in visited) + 1
-    left = look_ahead(planner, planner.rough_places, [tour], here, rest)
-    assert len(left.visits) == len(whole.visits) - done
-    for one, other in zip(left.visits[len(rest.ids) :], whole.visits[done + len(rest.ids) :]):
-        assert (one.split, one.pose) == (other.split, other.pose)
+    here, open_stop = stop.solutions[0], tour.with_route(stop, stop.ids[1:])
+    done = sum(len(visit.ids) for visit in visited) + 1
+    forecast = look_ahead(planner, planner.rough_places, [tour], here, open_stop)
+    assert len(forecast.visits) == len(full_forecast.visits) - done
+    for visit, other in zip(
+        forecast.visits[len(open_stop.ids) :], full_forecast.visits[done + len(open_stop.ids) :]
+    ):
+        assert (visit.split, visit.pose) == (other.split, other.pose)
     assert tour.visited == 7
     # What the fit will state depends on all of it.
-    assert left.joint_std == whole.joint_std
+    assert forecast.joint_std == full_forecast.joint_std
 
 
 def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collection_has():
@@ -252,20 +254,20 @@ def test_a_verification_has_ten_poses_off_and_on_in_random_order_that_no_collect
     assert len(visits) == 20
     assert {visit.split for visit in visits} == {'validation'}
     pairs = list(zip(visits[::2], visits[1::2]))
-    first = [one.correction for one, _ in pairs]
+    first = [twin.correction for twin, _ in pairs]
     assert {'on', 'off'} == set(first)
-    for one, other in pairs:
-        assert {one.correction, other.correction} == {'on', 'off'}
-        np.testing.assert_array_equal(one.solutions, other.solutions)
+    for twin, other in pairs:
+        assert {twin.correction, other.correction} == {'on', 'off'}
+        np.testing.assert_array_equal(twin.solutions, other.solutions)
         # The arm stands there already, as far as it is planned.
         assert [len(way) for way in other.paths] == [0]
-    wanted = np.concatenate([one.solutions for one, _ in pairs])
+    wanted = np.concatenate([twin.solutions for twin, _ in pairs])
     assert len(np.unique(wanted, axis=0)) == 10
     collected = planner.collection(planner.rough_places)
     assert collected.inspection == ''
     used = [q for plan in collected.plans.values() for pose in plan.poses for q in pose.solutions]
-    away = np.max(np.abs(wanted[:, None] - np.array(used)), axis=2)
-    assert away.min() > 0.02
+    distances = np.max(np.abs(wanted[:, None] - np.array(used)), axis=2)
+    assert distances.min() > 0.02
     # Of a seed the same, of another one others.
     again = planner.verification()
     assert fingerprint(again) == fingerprint(planner.verification()) != fingerprint(collected)

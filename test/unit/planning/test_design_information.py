@@ -52,8 +52,8 @@ def dense_std(q, pose, expected):
     model, x = nominal_model(CHAIN, q, expected, Priors())
     rows = expected_measurements(model, q, pose, expected)
     # Where joint 1 and joint 7 are held nothing is left undetermined.
-    held = [0, 6]
-    free = np.setdiff1d(np.arange(model.size), held)
+    fixed_joints = [0, 6]
+    free = np.setdiff1d(np.arange(model.size), fixed_joints)
     reference = model.reference
 
     def predicted(values):
@@ -71,15 +71,15 @@ def dense_std(q, pose, expected):
             for e in np.eye(len(free))
         ]
     ).T
-    one = np.zeros((len(rows), len(rows)))
+    axis_covariance = np.zeros((len(rows), len(rows)))
     for i in range(len(rows)):
         sensor = expected[rows.sensor[i]]
         same = rows.sensor == rows.sensor[i]
-        one[i] += sensor.pose_sigma_m**2 * (same & (rows.pose == rows.pose[i]))
+        axis_covariance[i] += sensor.pose_sigma_m**2 * (same & (rows.pose == rows.pose[i]))
         frame = same & (rows.configuration == rows.configuration[i])
-        one[i] += sensor.frame_sigma_m**2 * frame
-        one[i, i] += sensor.sigma_m**2
-    covariance = np.kron(one, np.eye(3))
+        axis_covariance[i] += sensor.frame_sigma_m**2 * frame
+        axis_covariance[i, i] += sensor.sigma_m**2
+    covariance = np.kron(axis_covariance, np.eye(3))
     information = J.T @ np.linalg.solve(covariance, J)
     markers = np.isin(free, np.arange(19, model.size))
     information[markers, markers] += 1 / MARKER_STD**2
@@ -98,26 +98,26 @@ def test_it_is_the_information_under_the_whole_covariance_of_all_readings():
 def test_one_more_is_the_sum_with_one_more_and_gains_what_first_order_says():
     rng = np.random.default_rng(4)
     chosen = rng.permutation(len(WHOLE))[:20].tolist()
-    others = np.setdiff1d(np.arange(len(WHOLE)), chosen)
-    each = WHOLE.with_each(chosen, others)
-    for matrix, other in zip(each, others):
-        whole = WHOLE.total([*chosen, int(other)])
-        np.testing.assert_allclose(matrix, whole, rtol=1e-9, atol=1e-9 * np.abs(whole).max())
+    candidates = np.setdiff1d(np.arange(len(WHOLE)), chosen)
+    each = WHOLE.with_each(chosen, candidates)
+    for matrix, other in zip(each, candidates):
+        total = WHOLE.total([*chosen, int(other)])
+        np.testing.assert_allclose(matrix, total, rtol=1e-9, atol=1e-9 * np.abs(total).max())
     root = rng.standard_normal((len(WHOLE.scale), 3))
     more = each - WHOLE.total(chosen)
     expected = np.einsum('ij,nik,kj->n', root, more, root)
-    np.testing.assert_allclose(WHOLE.gains(chosen, root)[others], expected, rtol=1e-6)
+    np.testing.assert_allclose(WHOLE.gains(chosen, root)[candidates], expected, rtol=1e-6)
 
 
 def test_a_repeat_at_a_pose_tells_less_than_the_same_at_another_pose():
     # Where nearly all noise is the pose's, further solutions add little to it.
     noise = replace(sensors()[0], sigma_m=1e-6)
-    apart = [PlannedPose(p.T_R_T, q[None]) for p in POSES for q in p.solutions]
+    split_poses = [PlannedPose(p.T_R_T, q[None]) for p in POSES for q in p.solutions]
     shared = DesignInformation.of(CHAIN, POSES, [noise], MARKER_STD)
-    own = DesignInformation.of(CHAIN, apart, [noise], MARKER_STD)
-    assert len(own) == len(shared)
-    chosen = range(len(own))
-    loss = np.linalg.eigvalsh(own.total(chosen) - shared.total(chosen))
+    split_information = DesignInformation.of(CHAIN, split_poses, [noise], MARKER_STD)
+    assert len(split_information) == len(shared)
+    chosen = range(len(split_information))
+    loss = np.linalg.eigvalsh(split_information.total(chosen) - shared.total(chosen))
     # Sharing a pose helps directions that differ between its solutions and hurts the others.
     assert loss.max() > 0
 

@@ -126,8 +126,8 @@ def variance(rows):
 
 def until(rows, seconds):
     """The rows before a time."""
-    some = slice(0, int(np.searchsorted(rows.seconds, seconds)))
-    return MotionRows(*(values[some] for values in vars(rows).values()))
+    part = slice(0, int(np.searchsorted(rows.seconds, seconds)))
+    return MotionRows(*(values[part] for values in vars(rows).values()))
 
 
 def along_lines(found):
@@ -156,10 +156,10 @@ def test_information_a_second_beats_random_curves_and_straight_lines():
         found, drawn = designed(seed), designed(seed, exchanges=0, seconds=40.0)
         # As many seconds of each; more is drawn than that.
         assert found.moving_s < 25.0 < drawn.moving_s
-        own, rows = variance(moved(found)), (moved(drawn), along_lines(drawn))
+        of_found, rows = variance(moved(found)), (moved(drawn), along_lines(drawn))
         of_drawn, of_lines = (variance(until(each, found.moving_s)) for each in rows)
-        by_curves.append(of_drawn / own)
-        by_lines.append(of_lines / own)
+        by_curves.append(of_drawn / of_found)
+        by_lines.append(of_lines / of_found)
         print(f'seed {seed}: random curves {by_curves[-1]:.2f}, lines {by_lines[-1]:.2f}')
     assert np.median(by_curves) > 1.2
     assert np.median(by_lines) > 1.2
@@ -224,15 +224,15 @@ def test_curves_are_prepared_for_sensors_about_where_they_are(monkeypatch):
     monkeypatch.setattr(moving_design, 'EXCHANGES', 15)
     planner = planner_of()
     planner.prepare()
-    near = {name: T.copy() for name, T in planner.rough_places.items()}
-    near['mocap'][:3, 3] += (-0.05, 0.06, 0.09)
-    tour = planner.moving(near)
+    near_places = {name: T.copy() for name, T in planner.rough_places.items()}
+    near_places['mocap'][:3, 3] += (-0.05, 0.06, 0.09)
+    tour = planner.moving(near_places)
     prepared = planner.moving_design
     planner.moving(planner.rough_places)
     assert planner.moving_design is prepared
-    aside = {name: T.copy() for name, T in planner.rough_places.items()}
-    aside['mocap'][:3, 3] += (-0.5, 1.5, 0.0)
-    planner.moving(aside)
+    far_places = {name: T.copy() for name, T in planner.rough_places.items()}
+    far_places['mocap'][:3, 3] += (-0.5, 1.5, 0.0)
+    planner.moving(far_places)
     assert planner.moving_design is not prepared
     # Another planner prepares the same.
     other = planner_of()

@@ -27,15 +27,15 @@ JOINTS, TOOL = INFORMATION.joint_rms(REFERENCE), INFORMATION.tool_rms(REFERENCE)
 
 
 @cache
-def chosen(goal, seed=0, whole=False, **kwargs):
+def chosen(goal, seed=0, whole_poses=False, **kwargs):
     rng = np.random.default_rng(seed)
-    given = {'exchanges': 20, 'whole_poses': whole, **kwargs}
+    given = {'exchanges': 20, 'whole_poses': whole_poses, **kwargs}
     return choose(INFORMATION, TRAVEL, goal, rng, **given)
 
 
 @pytest.mark.parametrize('share', [0.0, 0.5])
 def test_whole_poses_reach_what_is_wanted_each_with_all_its_solutions(share):
-    design = chosen(Goal(JOINTS, TOOL, share), whole=True)
+    design = chosen(Goal(JOINTS, TOOL, share), whole_poses=True)
     assert design.reached
     assert INFORMATION.joint_rms(design.chosen) <= JOINTS
     assert len(design.chosen) < COUNT
@@ -48,16 +48,16 @@ def test_whole_poses_reach_what_is_wanted_each_with_all_its_solutions(share):
 def test_information_of_whole_poses_is_that_of_their_configurations():
     poses, members = INFORMATION.whole_poses()
     assert sorted(np.concatenate(members)) == list(range(len(INFORMATION)))
-    some = [0, 3, 7]
-    configurations = np.concatenate([members[i] for i in some])
+    indices = [0, 3, 7]
+    configurations = np.concatenate([members[i] for i in indices])
     np.testing.assert_allclose(
-        poses.total(some), INFORMATION.total(configurations), rtol=1e-9, atol=1e-12
+        poses.total(indices), INFORMATION.total(configurations), rtol=1e-9, atol=1e-12
     )
 
 
 def test_beyond_the_goal_the_floors_are_filled_with_the_cheapest_poses():
     """With a goal that three poses reach, the others are those with few solutions."""
-    design = chosen(Goal(1.2 * JOINTS, TOOL), whole=True, floors=Floors(12, 12))
+    design = chosen(Goal(1.2 * JOINTS, TOOL), whole_poses=True, floors=Floors(12, 12))
     pose, count = np.unique(INFORMATION.pose[list(design.chosen)], return_counts=True)
     assert len(pose) >= 12
     assert count.min() >= 2
@@ -108,12 +108,12 @@ def test_a_goal_out_of_reach_is_said_to_be():
     assert len(design.chosen) == 30
 
 
-@pytest.mark.parametrize('whole', [False, True])
+@pytest.mark.parametrize('whole_poses', [False, True])
 @pytest.mark.parametrize('count', [1, 3])
-def test_few_candidates_are_all_there_is(count, whole):
+def test_few_candidates_are_all_there_is(count, whole_poses):
     few = INFORMATION.only(np.arange(count))
     goal, rng = Goal(JOINTS, TOOL), np.random.default_rng(0)
-    design = choose(few, TRAVEL, goal, rng, whole_poses=whole)
+    design = choose(few, TRAVEL, goal, rng, whole_poses=whole_poses)
     assert not design.reached
     assert sorted(design.chosen) == list(range(count))
 

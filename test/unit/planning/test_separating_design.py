@@ -39,8 +39,8 @@ MEASURED, POOL = planned(30, 1), planned(60, 2)
 
 
 def sag(size=2e-5, *look_alikes):
-    others = look_alikes or (('encoder_eccentricity', (2,), 'the whole range'),)
-    return FoundCause('joint_compliance', (2,), {'compliance_2': size}, others)
+    alternatives = look_alikes or (('encoder_eccentricity', (2,), 'the whole range'),)
+    return FoundCause('joint_compliance', (2,), {'compliance_2': size}, alternatives)
 
 
 def separated(*causes, pool=POOL):
@@ -81,10 +81,12 @@ def dense_columns(poses):
     return base, by_joint_2 * np.stack(waves, axis=-1)[:, None], torque
 
 
-def dense_information(poses, base, other, one, std):
+def dense_information(poses, base, other, column, std):
     """Return the information on base, another cause of any size and the amplitude of one."""
-    pose = np.repeat(np.arange(len(poses)), [len(one.solutions) for one in poses])
-    J = np.concatenate([base, other, one], axis=2).reshape(3 * len(pose), -1)
+    pose = np.repeat(
+        np.arange(len(poses)), [len(planned_pose.solutions) for planned_pose in poses]
+    )
+    J = np.concatenate([base, other, column], axis=2).reshape(3 * len(pose), -1)
     noise = BAR.sigma_m**2 * np.eye(len(pose)) + BAR.pose_sigma_m**2 * (pose[:, None] == pose)
     prior = [0.0] * 11 + [MARKER_STD**-2] * 3 + [std**-2] * other.shape[2] + [0.0]
     return J.T @ np.linalg.solve(np.kron(noise, np.eye(3)), J) + np.diag(prior)
@@ -111,11 +113,11 @@ def test_what_is_chosen_tells_more_than_any_of_the_pool():
     rng = np.random.default_rng(3)
     blind = []
     for _ in range(5):
-        poses, left = [], count
+        poses, remaining_count = [], count
         for index in rng.permutation(len(POOL)):
             poses.append(POOL[index])
-            left -= len(POOL[index].solutions)
-            if left <= 0:
+            remaining_count -= len(POOL[index].solutions)
+            if remaining_count <= 0:
                 break
         blind.append(dense_apart([*MEASURED, *poses], MEASURED))
     gained = pair.after**2 - pair.before**2
@@ -171,8 +173,8 @@ def test_other_postures_of_a_held_joint_are_candidates():
 
 
 def test_a_rail_is_held_elsewhere_by_as_much_as_an_elbow_counts(tmp_path):
-    held = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [0.0]}
-    cell = read_cell(sliding_cell(tmp_path, rail(), **held))
+    options = {'held_joint': 'rail', 'held_values_deg': [], 'held_values_m': [0.0]}
+    cell = read_cell(sliding_cell(tmp_path, rail(), **options))
     further = scene_with_other_elbows(cell.planning_scene(cell.chain()))
     steps = 0.25 * np.radians([-60, -30, 0, 30, 60])
     np.testing.assert_allclose(further.inverse_kinematics.held[0], steps, atol=1e-9)
@@ -181,7 +183,9 @@ def test_a_rail_is_held_elsewhere_by_as_much_as_an_elbow_counts(tmp_path):
 def session_rows(seed=5):
     """Return measured rows of the poses, one after the other, the arm getting warmer."""
     q = np.concatenate([pose.solutions for pose in MEASURED])
-    pose = np.repeat(np.arange(len(MEASURED)), [len(one.solutions) for one in MEASURED])
+    pose = np.repeat(
+        np.arange(len(MEASURED)), [len(planned_pose.solutions) for planned_pose in MEASURED]
+    )
     order = np.random.default_rng(seed).permutation(len(q))
     model, _ = nominal_model(CHAIN, q, [BAR], Priors())
     rows = expected_measurements(model, q[order], pose[order], [BAR])

@@ -62,11 +62,11 @@ def test_every_solution_once_nearest_first_and_splits_among_each_other():
     visited = np.concatenate([stop.solutions for stop in stops])
     assert sorted(map(tuple, planned)) == sorted(map(tuple, visited))
     # Each pose is the nearest of those left to where the last one ended.
-    here, left = CHAIN.forward(np.zeros(7))[:3, 3], [s.T_R_T[:3, 3] for s in stops]
+    here, remaining_places = CHAIN.forward(np.zeros(7))[:3, 3], [s.T_R_T[:3, 3] for s in stops]
     for stop in stops:
-        distances = [np.linalg.norm(p - here) for p in left]
+        distances = [np.linalg.norm(p - here) for p in remaining_places]
         assert np.linalg.norm(stop.T_R_T[:3, 3] - here) == pytest.approx(min(distances))
-        left.pop(int(np.argmin(distances)))
+        remaining_places.pop(int(np.argmin(distances)))
         here = CHAIN.forward(stop.solutions[-1])[:3, 3]
 
 
@@ -135,7 +135,9 @@ def free_plan(model, seed, poses, solutions=4):
     """A plan whose every configuration is free."""
     q = np.random.default_rng(seed).uniform(CHAIN.lower, CHAIN.upper, (400, 7))
     q = q[model.free_mask(q, RESERVE_M)][: poses * solutions].reshape(poses, solutions, 7)
-    return Plan(tuple(PlannedPose(CHAIN.forward(own[0]), own) for own in q))
+    return Plan(
+        tuple(PlannedPose(CHAIN.forward(solution_set[0]), solution_set) for solution_set in q)
+    )
 
 
 @pytest.mark.parametrize('seed', [1, 2])
@@ -185,8 +187,8 @@ def test_a_solution_behind_a_free_one_waits_and_one_that_is_shut_in_is_unreached
     stop = Tour(chain, {'optimization': plan}, model=model).next(np.array([0.0]))
     assert (stop.ids, stop.unreached) == ((1,), (0,))
     # Where one is enough, the free one is it, and nothing is lost.
-    one = Tour(chain, {'optimization': plan}, one_solution=True, model=model)
-    stop = one.next(np.array([0.0]))
+    tour = Tour(chain, {'optimization': plan}, one_solution=True, model=model)
+    stop = tour.next(np.array([0.0]))
     assert (stop.ids, stop.unreached) == ((1,), ())
     shut = Tour(
         chain,
@@ -202,11 +204,11 @@ def test_what_is_left_of_a_stop_is_reached_from_elsewhere():
     model = walled()
     tour = Tour(CHAIN, {'optimization': free_plan(model, 3, 2)}, model=model)
     stop = tour.next(np.zeros(7))
-    left = tour.with_route(stop, stop.ids[1:])
-    assert len(left.paths) == len(left.ids)
+    open_stop = tour.with_route(stop, stop.ids[1:])
+    assert len(open_stop.paths) == len(open_stop.ids)
     elsewhere = np.deg2rad([-150.0, 20, 0, 60, 0, 30, 0])
-    again = tour.reroute(left, elsewhere)
-    assert sorted([*again.ids, *again.unreached]) == sorted(left.ids)
+    again = tour.reroute(open_stop, elsewhere)
+    assert sorted([*again.ids, *again.unreached]) == sorted(open_stop.ids)
     assert again.pose == stop.pose
     here = elsewhere
     for way, solution, number in zip(again.paths, again.solutions, again.ids):
@@ -226,14 +228,14 @@ def test_proposing_changes_nothing():
     assert tour.propose(np.zeros(7)).pose == 1
 
 
-@pytest.mark.parametrize('held', [(0.0,), (-1.0, 0.0, 1.0)])
-def test_low_poses_are_not_reached_through_the_floor(held):
+@pytest.mark.parametrize('held_values', [(0.0,), (-1.0, 0.0, 1.0)])
+def test_low_poses_are_not_reached_through_the_floor(held_values):
     """Straight moves between nearest solutions sweep far: some went through the floor."""
     chain = CHAIN
     model = CollisionModel(chain, arm_bodies(chain, [], 0.075))
     low = PoseRanges(height_m=(0.1, 0.6))
     candidates = candidate_poses(150, low, [1.9, 0.0, 1.1], np.random.default_rng(4))
-    inverse = InverseKinematics(chain, {2: held})
+    inverse = InverseKinematics(chain, {2: held_values})
     plan = plan_poses(inverse, model, candidates, limit_margin_rad=0.02)
 
     def troubles(tour):

@@ -73,10 +73,10 @@ def test_it_beats_the_nearest_first():
     for seed in range(20):
         points = np.random.default_rng(seed).random((60, 3))
         times = np.linalg.norm(points[:, None] - points, axis=-1)
-        nearest, left = [0], set(range(1, 60))
-        while left:
-            nearest.append(min(left, key=lambda other: times[nearest[-1], other]))
-            left.remove(nearest[-1])
+        nearest, remaining_points = [0], set(range(1, 60))
+        while remaining_points:
+            nearest.append(min(remaining_points, key=lambda other: times[nearest[-1], other]))
+            remaining_points.remove(nearest[-1])
         order = fastest_order(times)
         gains.append(length(times, order) / length(times, nearest[1:]))
     assert max(gains) <= 1.0

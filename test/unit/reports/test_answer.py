@@ -139,8 +139,8 @@ def test_causes_that_stay_are_listed_with_their_remedy_and_the_others_are_not(in
     assert [row.remedy for row in remains] == [NO_FILE, 'The remedy.']
     answer = answer_of(inputs([LENGTH], model=0.3))
     assert answer.mood == 'good'
-    (left,) = answer.remains
-    assert left.what == 'Noise'
+    (item,) = answer.remains
+    assert item.what == 'Noise'
 
 
 @pytest.mark.parametrize(
@@ -213,10 +213,10 @@ def test_a_robot_model_is_judged_as_it_is(fit_result):
 def test_what_no_cause_explains_is_never_called_noise(inputs, fit):
     assert [row.what for row in answer_of(inputs([])).remains] == ['Noise']
     fit.judgement.findings = ['tracker: the error after is 0.500 mm; noise makes 0.100 mm.']
-    alone = answer_of(inputs()).remains[0]
-    assert (alone.what, alone.size) == ('More than noise', fit.judgement.findings[0])
-    assert 'remaster discover' in alone.sentence
-    assert '..' not in alone.sentence
+    item = answer_of(inputs()).remains[0]
+    assert (item.what, item.size) == ('More than noise', fit.judgement.findings[0])
+    assert 'remaster discover' in item.sentence
+    assert '..' not in item.sentence
     (searched,) = answer_of(inputs([])).remains
     assert searched.what == 'More than noise'
     assert searched.size.startswith(fit.judgement.findings[0].rstrip('.'))
@@ -255,8 +255,8 @@ def test_the_column_beside_what_to_do_is_filled_below_the_plot(inputs, fit_resul
 def test_a_doubt_is_no_finding(inputs, fit):
     """Where nothing shows how large the noise is, nobody is told that it is exceeded."""
     fit.judgement.doubts = ['tracker: nothing shows how much of the 0.500 mm is noise.']
-    alone = answer_of(inputs()).remains[0]
-    assert (alone.what, alone.size) == (
+    item = answer_of(inputs()).remains[0]
+    assert (item.what, item.size) == (
         'May be sensor noise alone',
         fit.judgement.doubts[0],
     )
@@ -292,8 +292,8 @@ def test_single_gross_errors_decide_nothing(inputs):
     assert answer.not_counted == len(rows)
     assert f'({len(rows)} gross errors not counted)' in answer.headline
     # A third of them is no matter of single gross errors.
-    many = held_out[: len(held_out) // 3]
-    made.found.noise.outliers = made.session.measurements.observation[many].tolist()
+    third = held_out[: len(held_out) // 3]
+    made.found.noise.outliers = made.session.measurements.observation[third].tolist()
     assert answer_of(made).not_counted == 0
 
 
@@ -304,25 +304,27 @@ def test_an_error_of_the_measurement_is_no_gain_of_the_arm(inputs):
     assert '10 times smaller' in answer_of(inputs([LENGTH], model=0.3)).headline
 
 
-@pytest.mark.parametrize('held', ['fit', 'discovery', 'disagreement', 'undetermined', 'unproven'])
-def test_no_green_where_anything_disagrees(inputs, fit, held):
+@pytest.mark.parametrize(
+    'obstacle', ['fit', 'discovery', 'disagreement', 'undetermined', 'unproven']
+)
+def test_no_green_where_anything_disagrees(inputs, fit, obstacle):
     effects, options = [LENGTH], {}
-    if held == 'fit':
+    if obstacle == 'fit':
         effects, fit.judgement.mood = [], 'caution'
-    elif held == 'discovery':
+    elif obstacle == 'discovery':
         options['mood'] = 'caution'
-    elif held == 'disagreement':
+    elif obstacle == 'disagreement':
         fit.judgement.disagreements = ['While it was measured, tracker moved.']
-    elif held == 'undetermined':
+    elif obstacle == 'undetermined':
         options['verdict'] = 'undetermined'
     made = inputs(effects, **options)
-    if held == 'unproven':
+    if obstacle == 'unproven':
         m = made.session.measurements
         fitted = replace(m, is_validation=np.zeros(len(m), bool))
         made = replace(made, session=replace(made.session, measurements=fitted))
     answer = answer_of(made)
     assert answer.mood == 'caution'
-    if held == 'disagreement':
+    if obstacle == 'disagreement':
         assert any('tracker moved' in row.size for row in answer.remains)
 
 
@@ -494,12 +496,12 @@ def test_no_robot_model_is_loaded_that_imitates_what_is_no_length_and_no_tilt(in
 
 
 def test_what_the_measurement_errs_by_is_said_where_it_stays_in_both_errors(inputs):
-    told = answer_of(inputs([LENGTH, {**BUMP, 'sizes': []}], model=0.4))
-    assert told.loads_model
-    title = told.remains[0].what
-    assert told.headline.endswith(f'Both contain what the measurement errs by ({title}).')
+    answer = answer_of(inputs([LENGTH, {**BUMP, 'sizes': []}], model=0.4))
+    assert answer.loads_model
+    title = answer.remains[0].what
+    assert answer.headline.endswith(f'Both contain what the measurement errs by ({title}).')
     # A cause without sizes of its own has that at the marker.
-    assert told.remains[0].size == '1.000 mm RMS at the marker'
+    assert answer.remains[0].size == '1.000 mm RMS at the marker'
     assert 'Both contain' not in answer_of(inputs([LENGTH], model=0.4)).headline
 
 
@@ -512,5 +514,5 @@ def test_so_few_poses_are_not_sent_to_a_search(inputs, fit):
 
 def test_one_held_out_pose_is_said_to_prove_little(inputs, fit):
     fit.session.validation.poses = 1
-    told = {row.what: row.size for row in answer_of(inputs()).remains}
-    assert 'Only 1 pose was held out' in told['Hardly proven']
+    sizes = {row.what: row.size for row in answer_of(inputs()).remains}
+    assert 'Only 1 pose was held out' in sizes['Hardly proven']

@@ -38,7 +38,9 @@ def inputs(fit_result, tmp_path) -> Inputs:
 
     def poses(count):
         q = rng.uniform(-1.5, 1.5, (count, 2, len(chain)))
-        return tuple(PlannedPose(chain.forward(own[0]), own) for own in q)
+        return tuple(
+            PlannedPose(chain.forward(solution_set[0]), solution_set) for solution_set in q
+        )
 
     plans = {
         FITTED: Plan(poses(3), {'unseen': 4}, {'unseen': 9, 'self-collision': 2}),

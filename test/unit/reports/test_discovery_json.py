@@ -101,7 +101,7 @@ def test_discovery_json_keeps_its_contract(saved):
     assert content['joint_offsets_after'][1].keys() >= {'joint', 'mean_deg', 'std_deg'}
     # Alone zero-offsets are those of the files for a controller that loads nothing else.
     layer = yaml.safe_load((folder / 'apply/offset_layer.yaml').read_text())
-    (parameters,) = (one['ros__parameters'] for one in layer.values())
+    (parameters,) = (node['ros__parameters'] for node in layer.values())
     loaded = dict(zip(parameters['joint_names'], parameters['joint_offsets'], strict=True))
     known = {
         r['joint']: r['mean_deg'] for r in content['joint_offsets_alone'] if r['identifiable']
@@ -159,11 +159,11 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
     data = found.residuals
     q = data.context.measurements.q[:, 1]
     # A curve of the same joint in place of the wave, with nothing measured in the middle of it.
-    away = np.abs(q - np.median(q)) > 0.3
+    is_measured = np.abs(q - np.median(q)) > 0.3
     candidate = next(
         c for c in EFFECTS['joint_error_curve'].candidates(data.context) if c.joints == (2,)
     )
-    curve = Curve.of(q[away & data.context.to_fit], 0.05)
+    curve = Curve.of(q[is_measured & data.context.to_fit], 0.05)
     names = tuple(f'height_{i}' for i in range(len(curve.places)))
     candidate = replace(
         candidate,
@@ -174,7 +174,7 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
     seed = 3
     print(f'seed {seed}')
     covariance = 1e-8 * np.linalg.inv(
-        curve.columns(q[away]).T @ curve.columns(q[away]) + 1e-3 * curve.penalty
+        curve.columns(q[is_measured]).T @ curve.columns(q[is_measured]) + 1e-3 * curve.penalty
     )
     draws = np.random.default_rng(seed).multivariate_normal(0.0 * curve.places, covariance, 400)
     solution = replace(found.solution, candidates=(candidate,), parameters=draws[0])
@@ -360,8 +360,8 @@ def test_what_is_no_better_in_the_figures_shown_is_not_to_be_loaded(monkeypatch)
     )
     model = SimpleNamespace(largest_slope=lambda: 0.1)
     monkeypatch.setattr(loadables, 'arm_of_effects', lambda *_: SimpleNamespace(model=model))
-    left = {'offsets': 2.0 * errors, 'geometry': errors, 'everything': 0.9999 * errors}
-    monkeypatch.setattr(loadables, 'errors_to_load', lambda _: left)
+    errors_by_result = {'offsets': 2.0 * errors, 'geometry': errors, 'everything': 0.9999 * errors}
+    monkeypatch.setattr(loadables, 'errors_to_load', lambda _: errors_by_result)
     results = loadable(found)
     assert [row.better for row in results] == [True, True, False]
     assert load_words(results[-1])[1].startswith('only where no robot model can be loaded')

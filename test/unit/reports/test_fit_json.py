@@ -123,10 +123,10 @@ def test_a_file_with_the_keys_of_the_contract_alone_is_read(fit_result, tmp_path
 
     def only(part, keys):
         if isinstance(part, list):
-            return [only(one, keys) for one in part]
+            return [only(item, keys) for item in part]
         if keys[0] in part:
             return {key: part[key] for key in keys}
-        return {name: only(one, keys) for name, one in part.items()}
+        return {name: only(item, keys) for name, item in part.items()}
 
     plain = {key: only(fit[key], keys.split()) for key, keys in kept.items()}
     plain |= {key: fit[key] for key in ('format', 'gauge', 'accuracy', 'left_out')}
@@ -233,10 +233,10 @@ def test_joints_without_origin_or_limits_are_calibrated_too():
 
 def test_roll_pitch_yaw_are_exact_at_and_near_the_singularity():
     rng = np.random.default_rng(4)
-    for away in (0.0, 1e-16, 1e-12, 1e-9, 1e-7, 1e-4, 1.0):
+    for distance in (0.0, 1e-16, 1e-12, 1e-9, 1e-7, 1e-4, 1.0):
         for sign in (-1, 1):
             rpy = rng.uniform(-3, 3, 3)
-            rpy[1] = sign * (np.pi / 2 - away)
+            rpy[1] = sign * (np.pi / 2 - distance)
             rotation = matrix_from_rpy(rpy)
             np.testing.assert_allclose(matrix_from_rpy(rpy_of(rotation)), rotation, atol=1e-14)
 

@@ -50,9 +50,9 @@ class Page:
         try:
             connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
             for name, value in given.items():
-                for one in value if isinstance(value, list) else [value]:
-                    if one is not None:
-                        connection.putheader(name, one)
+                for item in value if isinstance(value, list) else [value]:
+                    if item is not None:
+                        connection.putheader(name, item)
             content = b'' if body is None else body
             if method == 'POST':
                 connection.putheader('Content-Length', str(len(content)))

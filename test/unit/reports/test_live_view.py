@@ -82,11 +82,14 @@ def test_residuals_of_registration_poses_are_labelled(played):
 
 def test_the_line_under_the_bar_is_one_sentence_and_the_rest_is_complete(played):
     tour = 'planned 13 optimization poses with 40 configurations'
-    rest = ['6 reference configurations', 'dropped poses: ' + ', '.join(['12 beyond reach'] * 60)]
-    played.view.take(events.TourPlanned('; '.join([tour, *rest])), 1.0)
+    details = [
+        '6 reference configurations',
+        'dropped poses: ' + ', '.join(['12 beyond reach'] * 60),
+    ]
+    played.view.take(events.TourPlanned('; '.join([tour, *details])), 1.0)
     run = played.view.view(1.0)['run']
     assert run['plan'] == 'Planned 13 optimization poses with 40 configurations.'
-    assert run['plan_details'] == f'6 reference configurations; {rest[1]}.'
+    assert run['plan_details'] == f'6 reference configurations; {details[1]}.'
 
 
 def test_a_rejected_configuration_is_told_and_leaves_no_residual(played):

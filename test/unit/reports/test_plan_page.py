@@ -240,11 +240,11 @@ def test_a_plan_s_scripts_compile(planned):
     html = planned[0].read_text(encoding='utf-8')
     packed = re.search(r'id="code-gzip">([^<]*)<', html)[1]
     played = gzip.decompress(base64.b64decode(packed)).decode()
-    [own] = re.findall(r'<script>(.*?)</script>', html, re.DOTALL)
-    compiled(own + played)
+    [script] = re.findall(r'<script>(.*?)</script>', html, re.DOTALL)
+    compiled(script + played)
     # The judge judges: with one name declared twice it refuses.
     with pytest.raises((JSParseException, JSEvalException), match='already been declared'):
-        compiled(own + played + 'const RobotView = 1;')
+        compiled(script + played + 'const RobotView = 1;')
 
 
 def test_a_report_s_scripts_compile():

@@ -80,8 +80,8 @@ def test_the_page_shows_what_was_found(fit_result, page):
         f'{1e3 * np.linalg.norm(residuals[rows], axis=1).mean():.3f} mm'
         for residuals in (fit_result.residuals_before, fit_result.residuals_after)
     )
-    told = f'falls from {before} to {after} on poses it never fitted ({len(gross)} gross error'
-    assert told in text
+    sentence = f'falls from {before} to {after} on poses it never fitted ({len(gross)} gross error'
+    assert sentence in text
     for i, joint in enumerate(fit_result.joint_names):
         if fit_result.identifiable[i]:
             degrees = f'{np.degrees(fit_result.joint_offsets[i]):+.4f}'.replace('-', '−')

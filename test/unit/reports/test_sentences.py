@@ -52,9 +52,9 @@ def test_the_verdict_is_honest(fit_result, split, before, after, converged, mood
     judged = verdict(result)
     assert judged.mood == mood
     assert words in judged.headline
-    told = ' '.join(judged.points)
-    assert ('fit again with more draws' in told) != converged
-    assert ('No poses were held out' in told) == (split == 'optimization')
+    text = ' '.join(judged.points)
+    assert ('fit again with more draws' in text) != converged
+    assert ('No poses were held out' in text) == (split == 'optimization')
 
 
 def test_an_approximation_that_fails_its_check_is_never_green(fit_result):
@@ -84,10 +84,10 @@ def test_structure_in_the_residuals_is_never_green(fit_result):
     judged = verdict(result)
     assert judged.mood == 'caution'
     assert 'there are other errors beside it; run "remaster discover"' in judged.headline
-    told = ' '.join(judged.points)
-    assert 'follows the position in front of the sensor from pose to pose (p < 0.0001)' in told
-    assert 'follows time' not in told
-    assert 'up to 3.1 times as wide' in told
+    text = ' '.join(judged.points)
+    assert 'follows the position in front of the sensor from pose to pose (p < 0.0001)' in text
+    assert 'follows time' not in text
+    assert 'up to 3.1 times as wide' in text
     printed = '\n'.join(
         fit_lines(fit_content(replace(fit_result, noise_checks=(), structure=structure)))
     )
@@ -121,14 +121,14 @@ def test_an_error_that_noise_does_not_explain_is_never_green(fit_result, check, 
     result = replace(with_accuracy(fit_result, 'validation', 4.395, after), noise_checks=(check,))
     judged = verdict(result)
     assert judged.mood == 'caution'
-    told = f'{judged.headline} {judged.points[0]}'
+    text = f'{judged.headline} {judged.points[0]}'
     if check is MOVED:
         assert 'other errors dominate; run "remaster discover"' in judged.headline
-        assert '0.110 mm per axis within a pose' in told
-        assert 'makes 0.176 mm' in told
+        assert '0.110 mm per axis within a pose' in text
+        assert 'makes 0.176 mm' in text
     else:
         assert 'this session cannot show' in judged.headline
-        assert 'measure poses in all their joint solutions' in told
+        assert 'measure poses in all their joint solutions' in text
     assert judged.points[0].startswith('tracker: ')
     html = fit_html(replace(fit_result, noise_checks=(check,)), {})
     assert 'verdict caution' in html
@@ -174,7 +174,7 @@ def test_terminal_and_page_have_one_phrase_of_one_fact(fit_result):
     title = METRICS['post_registration']
     assert f'optimization, {title}: ' in printed
     assert title[0].upper() + title[1:] in page
-    worst = max(content.geometry.imitations, key=lambda one: one.deg)
+    worst = max(content.geometry.imitations, key=lambda imitation: imitation.deg)
     words = as_drawn(content.geometry, [worst])
     assert words in printed
     assert words.rpartition(' mm at ')[2] in page
@@ -192,10 +192,10 @@ def test_the_order_of_rows_is_not_called_time_where_there_are_no_times(fit_resul
     timed = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), structure=structure)
     assert 'change with time within the poses' in ' '.join(verdict(timed).findings)
     ordered = replace(timed, session=replace(fit_result.session, timed=False))
-    told = ' '.join(verdict(ordered).findings)
-    assert 'change with the order of the rows within the poses' in told
-    assert 'follows the order of the rows from pose to pose' in told
-    assert 'time' not in told
+    text = ' '.join(verdict(ordered).findings)
+    assert 'change with the order of the rows within the poses' in text
+    assert 'follows the order of the rows from pose to pose' in text
+    assert 'time' not in text
 
 
 def test_where_poses_are_too_few_no_other_errors_are_said_to_dominate(fit_result):
@@ -210,16 +210,16 @@ def test_the_mean_without_the_largest_errors_is_said_to_be_that(fit_result):
     """It stands beside the mean of all; and of scatter within poses not all counts as noise."""
     check = NoiseCheck.of(0.934e-3, 6e-6, 0.89e-3, sensor='tracker', poses=200)
     result = replace(with_accuracy(fit_result, 'validation', 1.0, 0.979), noise_checks=(check,))
-    told = verdict(result).findings[0]
-    assert 'the error after is 0.934 mm without its largest values' in told
-    assert '0.890 mm per axis within a pose, of which 0.030 mm count) makes 0.048 mm' in told
+    text = verdict(result).findings[0]
+    assert 'the error after is 0.934 mm without its largest values' in text
+    assert '0.890 mm per axis within a pose, of which 0.030 mm count) makes 0.048 mm' in text
 
 
 def test_one_held_out_pose_is_never_green(fit_result):
     proven = replace(with_accuracy(fit_result, 'validation', 4.0, 0.5), noise_checks=())
     assert verdict(proven).mood == 'good'
     m = proven.session.measurements
-    one = ~m.is_validation | (m.pose == m.pose[m.is_validation][0])
-    judged = verdict(replace(proven, session=proven.session.select(one)))
+    rows = ~m.is_validation | (m.pose == m.pose[m.is_validation][0])
+    judged = verdict(replace(proven, session=proven.session.select(rows)))
     assert judged.mood == 'caution'
     assert any('Only 1 pose was held out' in point for point in judged.points)

@@ -82,15 +82,15 @@ class Bar:
 @pytest.mark.parametrize(('rate', 'dwell_s'), [(100.0, 0.5), (30.0, 0.5), (30.0, 0.2)])
 @pytest.mark.parametrize('share', [0.02, 0.1, 0.3])
 def test_no_mean_is_off_by_what_a_damaged_frame_may_be(share, rate, dwell_s):
-    bar, off, left = Bar(1, share, rate), [], 0
+    bar, off, rejected_count = Bar(1, share, rate), [], 0
     # As many frames of each.
     for _ in range(round(1500 / (rate * dwell_s))):
         found, sent = bar.reading(dwell_s)
         if isinstance(found, PairedReading):
             off.append(np.linalg.norm(found.position - sent))
         else:
-            left += 1
-    assert len(off) > 0.9 * (len(off) + left)
+            rejected_count += 1
+    assert len(off) > 0.9 * (len(off) + rejected_count)
     assert max(off) < MOST_OFF_M
     if share > 0.02:
         # There were such frames.

@@ -240,9 +240,9 @@ def test_all_markers_of_a_frame_are_read_and_a_hidden_one_hides_no_other(version
 
     with followed(samples.append, options, **how) as (_, client):
         assert names_seen() == {'', 'b', 'c'}
-        for number, others in ((1, {'b', 'c'}), (4, {'', 'b'})):
+        for number, names in ((1, {'b', 'c'}), (4, {'', 'b'})):
             world.faulty = {'hidden': number}
-            assert names_seen() == others
+            assert names_seen() == names
             assert client.diagnosis().fault == 'none', client.diagnosis()
         counts = client.further_counts()
     assert counts['c'].dropped[Dropped.OCCLUDED] > 0
@@ -258,10 +258,10 @@ def test_all_markers_of_a_frame_are_read_and_a_hidden_one_hides_no_other(version
         assert frame.keys() == {'', 'b', 'c'}
         assert len({(s.timestamp_s, s.age_s, s.received_s) for s in frame.values()}) == 1
         for name, sample in frame.items():
-            apart = sample.position - frame[''].position
-            if np.all(np.isfinite(apart)):
+            offset = sample.position - frame[''].position
+            if np.all(np.isfinite(offset)):
                 # The wire has 32-bit numbers.
-                np.testing.assert_allclose(apart, world.places[name], atol=1e-6)
+                np.testing.assert_allclose(offset, world.places[name], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -190,8 +190,8 @@ def test_a_slow_listener_keeps_no_datagram_in_the_socket():
 
 
 def test_what_waits_is_bounded_and_the_rest_counted(monkeypatch):
-    one = len(natnet.encode_message(full_frame((3, 1)), (3, 1)))
-    monkeypatch.setattr(natnet_client, 'MAX_BACKLOG_BYTES', 100 * one)
+    size = len(natnet.encode_message(full_frame((3, 1)), (3, 1)))
+    monkeypatch.setattr(natnet_client, 'MAX_BACKLOG_BYTES', 100 * size)
     client = received(130, print)
     assert len(client._backlog) == 100
     assert client.status().dropped[Dropped.OVERRUN] == 30

@@ -173,13 +173,13 @@ def test_a_killed_writer_leaves_all_it_wrote(tmp_path, caplog):
 
 
 def test_a_cut_at_any_byte_loses_only_what_is_behind_it(bag, tmp_path):
-    whole = (bag / 'bag_0.mcap').read_bytes()
+    data = (bag / 'bag_0.mcap').read_bytes()
     wanted = list(messages())
     path = tmp_path / 'cut.mcap'
     counts = []
     rng = np.random.default_rng(3)
-    for cut in np.sort(rng.integers(0, len(whole), 300)):
-        path.write_bytes(whole[:cut])
+    for cut in np.sort(rng.integers(0, len(data), 300)):
+        path.write_bytes(data[:cut])
         reader = BagReader(path)
         read = list(reader)
         assert read == wanted[: len(read)]
@@ -198,12 +198,12 @@ def test_garbage_is_refused(tmp_path):
 
 
 def test_zeros_after_a_power_cut_are_no_messages(bag, tmp_path):
-    whole = (bag / 'bag_0.mcap').read_bytes()
+    data = (bag / 'bag_0.mcap').read_bytes()
     path = tmp_path / 'zeros.mcap'
     wanted = list(messages())
     counts = set()
-    for cut in range(len(whole) // 2, len(whole) // 2 + 400, 5):
-        path.write_bytes(whole[:cut] + bytes(5000))
+    for cut in range(len(data) // 2, len(data) // 2 + 400, 5):
+        path.write_bytes(data[:cut] + bytes(5000))
         reader = BagReader(path)
         assert not reader.complete
         assert list(reader) == wanted[: reader.whole.count]
@@ -261,5 +261,5 @@ def test_a_full_disk_delays_messages_until_memory_is_full_too(tmp_path, full_dis
     reader = BagReader(tmp_path / 'bag')
     assert reader.complete
     assert list(reader) == [*given[:kept], given[-1]]
-    with AnyReader([tmp_path / 'bag']) as whole:
-        assert {connection.topic for connection in whole.connections} == set(TOPICS)
+    with AnyReader([tmp_path / 'bag']) as any_reader:
+        assert {connection.topic for connection in any_reader.connections} == set(TOPICS)

@@ -58,21 +58,21 @@ def test_a_clock_begun_anew_shifts_the_next_file(tmp_path):
 
 def test_a_kill_at_any_step_of_a_recovery_is_recovered(tmp_path, monkeypatch):
     """Stop before each change of a file in turn; the next recovery always gets there."""
-    whole = tmp_path / 'whole'
-    abandon(whole, 0, 15)
+    original = tmp_path / 'whole'
+    abandon(original, 0, 15)
     steps = 0
     while True:
         steps += 1
         folder = tmp_path / str(steps) / 'bag'
-        shutil.copytree(whole, folder)
+        shutil.copytree(original, folder)
         (folder / 'whole_0.mcap').rename(folder / 'bag_0.mcap')
-        left = steps
+        remaining = steps
 
         def stop(function):
             def count(*args, **kwargs):
-                nonlocal left
-                left -= 1
-                if left == 0:
+                nonlocal remaining
+                remaining -= 1
+                if remaining == 0:
                     raise KeyboardInterrupt
                 return function(*args, **kwargs)
 
@@ -102,7 +102,7 @@ def test_a_kill_at_any_step_of_a_recovery_is_recovered(tmp_path, monkeypatch):
 def spoilt(data, rng, kind):
     """Return bytes with a flipped bit, with some replaced, cut out or doubled, or with a tail."""
     data, i = bytearray(data), int(rng.integers(len(data)))
-    some = slice(i, i + int(rng.integers(1, 50)))
+    span = slice(i, i + int(rng.integers(1, 50)))
     if kind == 'flipped':
         data[i] ^= 1 << rng.integers(8)
     elif kind == 'replaced':
@@ -110,9 +110,9 @@ def spoilt(data, rng, kind):
     elif kind == 'filled':
         data[i : i + 8] = b'\xff' * 8
     elif kind == 'doubled':
-        data[i:i] = data[some]
+        data[i:i] = data[span]
     elif kind == 'cut out':
-        del data[some]
+        del data[span]
     elif kind == 'cut off':
         del data[i:]
     else:
@@ -127,9 +127,9 @@ def test_a_closed_bag_is_itself_or_refused(bag, kind):
     print('seed', seed)
     rng = np.random.default_rng(seed)
     path = bag / 'bag_0.mcap'
-    whole = path.read_bytes()
+    data = path.read_bytes()
     for _ in range(40):
-        path.write_bytes(spoilt(whole, rng, kind))
+        path.write_bytes(spoilt(data, rng, kind))
         with pytest.raises(InputError, match=r'bag_0\.mcap'):
             BagReader(bag)
 
@@ -142,10 +142,10 @@ def test_without_its_checksum_a_bag_gives_the_one_error_or_no_other_message(bag,
     rng = np.random.default_rng(seed)
     (bag / MANIFEST).unlink()
     path = bag / 'bag_0.mcap'
-    whole, wanted = path.read_bytes(), list(messages())
+    data, wanted = path.read_bytes(), list(messages())
     refused = 0
     for _ in range(120):
-        path.write_bytes(spoilt(whole, rng, kind))
+        path.write_bytes(spoilt(data, rng, kind))
         try:
             read = list(BagReader(bag))
         except InputError:

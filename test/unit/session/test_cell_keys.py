@@ -137,10 +137,10 @@ def test_wrong_keys_of_sensors_are_one_line(tmp_path, changes, message):
     ],
 )
 def test_a_wrong_cell_names_line_key_and_what_was_meant(tmp_path, old, new, words):
-    told = refused(tmp_path, (old, new))
-    assert f'line {DEMO[: DEMO.index(old)].count(chr(10)) + 1}: {words}' in told
+    message = refused(tmp_path, (old, new))
+    assert f'line {DEMO[: DEMO.index(old)].count(chr(10)) + 1}: {words}' in message
     named = ('markerz', 'topc', 'traker', 'joint3')
-    assert ('did you mean' in told) == any(name in new for name in named)
+    assert ('did you mean' in message) == any(name in new for name in named)
 
 
 @pytest.mark.parametrize(
@@ -151,9 +151,9 @@ def test_a_wrong_cell_names_line_key_and_what_was_meant(tmp_path, old, new, word
     ],
 )
 def test_a_name_that_is_nearly_one_is_asked_for(tmp_path, name, wrong, words, file):
-    told = refused(tmp_path, (name, name + wrong), file=file)
-    assert words in told
-    assert 'did you mean' in told
+    message = refused(tmp_path, (name, name + wrong), file=file)
+    assert words in message
+    assert 'did you mean' in message
 
 
 def test_keys_reach_the_design(tmp_path):

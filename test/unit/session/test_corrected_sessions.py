@@ -57,8 +57,8 @@ def test_fit_says_so_and_the_rows_through_the_correction_have_none_left(tmp_path
     through = session.through_correction()
     np.testing.assert_array_equal(through.measurements.q, wanted)
     assert through.correction is None
-    left = fit_session(through, rng=np.random.default_rng(1), draws=200)
-    assert np.all(np.abs(left.joint_offsets / left.joint_offsets_std)[known] < 2.58)
+    fit = fit_session(through, rng=np.random.default_rng(1), draws=200)
+    assert np.all(np.abs(fit.joint_offsets / fit.joint_offsets_std)[known] < 2.58)
 
 
 def test_rows_through_a_correction_need_what_was_wanted():

@@ -400,8 +400,8 @@ def test_files_of_the_description_its_package_and_named_packages_are_read(tmp_pa
     assert '<linked/>' in read_description(path)
 
 
-@pytest.mark.parametrize('whole', [False, True])
-def test_a_file_that_the_user_names_is_read_wherever_it_lies(whole, cell, monkeypatch):
+@pytest.mark.parametrize('is_absolute', [False, True])
+def test_a_file_that_the_user_names_is_read_wherever_it_lies(is_absolute, cell, monkeypatch):
     """As of a UR, whose calibration lies with the robot and not with its description."""
     elsewhere = cell.parent / 'robots'
     elsewhere.mkdir()
@@ -420,7 +420,7 @@ def test_a_file_that_the_user_names_is_read_wherever_it_lies(whole, cell, monkey
     with pytest.raises(InputError, match='lies outside'):
         read_description(path)
     monkeypatch.chdir(elsewhere)
-    named = {'file': str(elsewhere / 'arm7.yaml') if whole else 'arm7.yaml'}
+    named = {'file': str(elsewhere / 'arm7.yaml') if is_absolute else 'arm7.yaml'}
     assert '<a b="0.425"/>' in read_description(path, named)
     with pytest.raises(InputError, match=r'other.yaml, which lies outside'):
         read_description(path, {**named, 'more': 'arm7.yaml'})

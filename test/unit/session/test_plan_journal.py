@@ -26,7 +26,10 @@ def chain():
 def plan_of(chain: SerialChain, seed: int, poses: int, solutions: int) -> Plan:
     rng = np.random.default_rng(seed)
     q = rng.uniform(-1.5, 1.5, (poses, solutions, len(chain)))
-    return Plan(tuple(PlannedPose(chain.forward(own[0]), own) for own in q), {'out of reach': 4})
+    return Plan(
+        tuple(PlannedPose(chain.forward(solution_set[0]), solution_set) for solution_set in q),
+        {'out of reach': 4},
+    )
 
 
 def killed_at_each_stop(chain, folder, rng, settings=SETTINGS, **tour):
@@ -124,13 +127,13 @@ def test_a_torn_line_is_dropped_and_a_damaged_one_refused(chain, tmp_path):
     book.open_visit(stop)
     book.record_state('running', 'abc')
     book.close()
-    whole = book.path.read_bytes()
-    book.path.write_bytes(whole[:-5])
+    data = book.path.read_bytes()
+    book.path.write_bytes(data[:-5])
     book = PlanJournal(tmp_path, SETTINGS, chain)
     assert 'cut off' in book.lost
     assert book.visit.ids == stop.ids
     book.close()
-    book.path.write_bytes(whole.replace(b'"stop"', b'"step"', 1))
+    book.path.write_bytes(data.replace(b'"stop"', b'"step"', 1))
     with pytest.raises(InputError, match='line 4: damaged'):
         PlanJournal(tmp_path, SETTINGS, chain)
 

@@ -20,7 +20,10 @@ JOINTS = len(CHAIN)
 
 def plan_of(seed, poses, solutions):
     q = np.random.default_rng(seed).uniform(-1.5, 1.5, (poses, solutions, JOINTS))
-    return Plan(tuple(PlannedPose(CHAIN.forward(own[0]), own) for own in q), {'unseen': 4})
+    return Plan(
+        tuple(PlannedPose(CHAIN.forward(solution_set[0]), solution_set) for solution_set in q),
+        {'unseen': 4},
+    )
 
 
 def collected(folder, expected=None):

@@ -197,15 +197,15 @@ def test_unknown_columns_are_reported_and_left_out(session, folder, caplog):
 
 def test_only_a_line_without_its_end_counts_as_torn(session, folder, caplog):
     path = folder / 'observations.csv'
-    whole = path.read_bytes()
-    last = whole.rstrip(b'\n').rfind(b'\n') + 1
-    for cut in (*range(last + 1, len(whole) - 1, 9), len(whole) - 1):
-        path.write_bytes(whole[:cut])
+    data = path.read_bytes()
+    last = data.rstrip(b'\n').rfind(b'\n') + 1
+    for cut in (*range(last + 1, len(data) - 1, 9), len(data) - 1):
+        path.write_bytes(data[:cut])
         caplog.clear()
         with caplog.at_level(logging.WARNING, 'remaster_ros'):
             assert len(read_session(folder).measurements) == len(session.measurements) - 1
         assert 'line 21: cut off' in caplog.text
-    path.write_bytes(whole[:last] + b'17,\n')
+    path.write_bytes(data[:last] + b'17,\n')
     refused(folder, 'line 21', '2 columns')
 
 
@@ -268,18 +268,18 @@ def test_references_stay_apart_from_what_is_fitted(session, tmp_path):
     """And survive the round trip, in the order measured."""
     m = session.measurements
     of_references = m.pose == 2
-    apart = replace(
+    split_session = replace(
         session,
         measurements=m.select(~of_references),
         references=m.select(of_references),
     )
-    write_session(tmp_path / 'session', apart)
+    write_session(tmp_path / 'session', split_session)
     text = (tmp_path / 'session' / 'observations.csv').read_text()
     assert text.count(',reference,') == 4
     found = read_session(tmp_path / 'session')
     for rows, wanted in (
-        (found.measurements, apart.measurements),
-        (found.references, apart.references),
+        (found.measurements, split_session.measurements),
+        (found.references, split_session.references),
     ):
         np.testing.assert_array_equal(rows.observation, wanted.observation)
         np.testing.assert_array_equal(rows.position, wanted.position)

@@ -117,10 +117,10 @@ def test_references_are_rows_of_their_own_and_are_remembered(session, tmp_path):
     assert [kind for kind, _, _ in book.watched] == ['reference', 'other', 'accepted', 'reference']
     assert [number for kind, number, _ in book.watched if kind == 'reference'] == [0, 2]
     for readings, (_, _, found) in zip(places, (book.watched[0], book.watched[3])):
-        for one, other in zip(readings, found, strict=True):
-            assert (one.sensor, one.stamp_s) == (other.sensor, other.stamp_s)
-            np.testing.assert_array_equal(one.position, other.position)
-            assert (one.std is None) == (other.std is None)
+        for original, other in zip(readings, found, strict=True):
+            assert (original.sensor, original.stamp_s) == (other.sensor, other.stamp_s)
+            np.testing.assert_array_equal(original.position, other.position)
+            assert (original.std is None) == (other.std is None)
     assert not book.registration
     write(book, 3, 0, [reading('mocap', 4.0)])
     book.close('complete')

@@ -178,9 +178,9 @@ def test_a_killed_session_is_gone_on_with(session, tmp_path):
     for row in rows[2:]:
         writer.append(row)
     writer.close()
-    with SessionWriter(tmp_path / 'whole', session) as whole:
+    with SessionWriter(tmp_path / 'whole', session) as single_run:
         for row in rows:
-            whole.append(row)
+            single_run.append(row)
     for name in ('observations.csv', 'session.yaml'):
         assert (tmp_path / 's' / name).read_bytes() == (tmp_path / 'whole' / name).read_bytes()
     with pytest.raises(InputError, match='is complete'):
@@ -234,15 +234,15 @@ def test_a_closed_file_that_changed_is_named_and_not_used(session, tmp_path, nam
     )  # fmt: skip
     assert check.returncode == 0, check.stdout
     path = tmp_path / 's' / name
-    whole = path.read_bytes()
+    original = path.read_bytes()
     seed = 4
     print('seed', seed)
     rng = np.random.default_rng(seed)
     for _ in range(50):
-        data = bytearray(whole)
+        data = bytearray(original)
         data[rng.integers(len(data))] ^= 1 << rng.integers(8)
         path.write_bytes(data)
         with pytest.raises(InputError, match=f'{name}: not as it was closed'):
             read_session(tmp_path / 's')
-    path.write_bytes(whole)
+    path.write_bytes(original)
     read_session(tmp_path / 's')

@@ -31,22 +31,26 @@ def halves(made):
     session = made.session
     poses = np.unique(session.measurements.pose)
     first = np.isin(session.measurements.pose, poses[::2])
-    one, other = session.select(first), session.select(~first)
+    first_half, second_half = session.select(first), session.select(~first)
     turned = rotation_vector_to_matrix(np.array([0.02, -0.3, 0.5]))
-    moved = other.measurements.position @ turned.T + np.array([0.3, -0.2, 0.1])
-    return one, replace(other, measurements=replace(other.measurements, position=moved))
+    moved = second_half.measurements.position @ turned.T + np.array([0.3, -0.2, 0.1])
+    return first_half, replace(
+        second_half, measurements=replace(second_half.measurements, position=moved)
+    )
 
 
 def test_the_arm_is_shared_and_registrations_are_not(made, halves) -> None:
     print('seed', SEED)
-    whole, lines = together([('monday', halves[0]), ('tuesday', halves[1])])
-    assert len(whole.measurements) == sum(len(half.measurements) for half in halves)
-    assert len(np.unique(whole.measurements.observation)) == len(whole.measurements)
+    joined_session, lines = together([('monday', halves[0]), ('tuesday', halves[1])])
+    assert len(joined_session.measurements) == sum(len(half.measurements) for half in halves)
+    assert len(np.unique(joined_session.measurements.observation)) == len(
+        joined_session.measurements
+    )
     assert len(lines) == 1
     assert 'tuesday' in lines[0]
     assert 'mocap_2' in lines[0]
     stds = []
-    for session in (*halves, whole):
+    for session in (*halves, joined_session):
         offsets, std = offsets_of(estimate(Problem.of(session)))
         known = std < np.radians(1.0)
         assert known.sum() >= 5
@@ -65,10 +69,15 @@ def test_markers_whose_names_are_numbered_already_keep_apart(halves) -> None:
         rows = replace(half.measurements, marker=half.measurements.observation % 3)
         sensors = dict(zip(half.sensors, places, strict=False))
         numbered.append(replace(half, markers=places, sensors=sensors, measurements=rows))
-    whole, _ = together([('monday', numbered[0]), ('tuesday', numbered[1])])
-    assert len(whole.markers) == 6
-    place = np.array([whole.markers[whole.marker_names[i]] for i in whole.measurements.marker])
-    np.testing.assert_array_equal(place[:, 0], whole.measurements.marker % 3)
+    joined_session, _ = together([('monday', numbered[0]), ('tuesday', numbered[1])])
+    assert len(joined_session.markers) == 6
+    place = np.array(
+        [
+            joined_session.markers[joined_session.marker_names[i]]
+            for i in joined_session.measurements.marker
+        ]
+    )
+    np.testing.assert_array_equal(place[:, 0], joined_session.measurements.marker % 3)
 
 
 @pytest.fixture(scope='module')
@@ -136,9 +145,9 @@ def test_what_is_not_of_one_arm_is_refused_by_name(halves) -> None:
 
 def test_sessions_without_times_stay_in_their_order(halves) -> None:
     first, second = (replace(half, timed=False) for half in halves)
-    whole, _ = together([('a', first), ('b', second)])
-    assert not whole.timed
-    stamps, count = whole.measurements.stamp_s, len(first.measurements)
+    joined_session, _ = together([('a', first), ('b', second)])
+    assert not joined_session.timed
+    stamps, count = joined_session.measurements.stamp_s, len(first.measurements)
     assert stamps[:count].max() < stamps[count:].min()
     mixed, _ = together([('a', halves[0]), ('b', second)])
     assert not mixed.timed

@@ -220,9 +220,9 @@ def find_from(offset_m: float, radius_m: float, timeout_s: float = 20.0) -> tupl
 
 
 def test_search_takes_longer_the_further_away():
-    near, middle, far = (find_from(offset, 0.6) for offset in (0.05, 0.2, 0.5))
-    assert [found for found, _ in (near, middle, far)] == [True] * 3
-    assert 1.0 < near[1] < middle[1] < far[1] < 20.0
+    near_result, middle, far = (find_from(offset, 0.6) for offset in (0.05, 0.2, 0.5))
+    assert [found for found, _ in (near_result, middle, far)] == [True] * 3
+    assert 1.0 < near_result[1] < middle[1] < far[1] < 20.0
 
 
 def test_search_ends_at_its_radius_and_at_its_time_out():

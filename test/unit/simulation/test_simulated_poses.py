@@ -110,20 +110,20 @@ def test_a_hidden_effect_turns_the_body_as_it_turns_three_markers_of_it(effect):
     by_markers = Rotation.concatenate(
         [Rotation.align_vectors(s - s[0], tool - tool[0])[0] for s in seen]
     )
-    apart = (given * by_markers.inv()).magnitude()
+    angle = (given * by_markers.inv()).magnitude()
     as_drawn = inverse(truth.sensors['mocap'].T_R_N) @ CHAIN.forward(
         m.q[::3] + truth.joint_offsets
     )
     moved = (given * Rotation.from_matrix(as_drawn[:, :3, :3]).inv()).magnitude()
     assert moved.max() > 1e-4
-    assert apart.max() < 1e-6 + 0.01 * moved.max()
+    assert angle.max() < 1e-6 + 0.01 * moved.max()
 
 
 def test_noise_is_what_was_asked_for():
     """600 readings at 150 poses; five standard deviations of each estimate."""
     session, truth = measured(64, poses=150, turn_sigma_rad=1e-3, pose_turn_sigma_rad=3e-3)
     error, pose = turn_errors(session, truth), session.measurements.pose
-    poses = [error[pose == one] for one in np.unique(pose)]
+    poses = [error[pose == number] for number in np.unique(pose)]
     spare = 3 * sum(len(e) - 1 for e in poses)
     within = np.sqrt(np.sum([np.sum((e - e.mean(axis=0)) ** 2) for e in poses]) / spare)
     assert within == pytest.approx(1e-3, rel=5.0 / np.sqrt(2.0 * spare))
@@ -148,9 +148,9 @@ def test_noise_along_the_line_of_sight_grows_with_the_square_of_the_distance(on_
     off = np.sum(error * along, axis=1)
     assert np.abs(error - off[:, None] * along).max() < 1e-9
     scaled = off / distance**2
-    near = distance < np.median(distance)
+    is_near = distance < np.median(distance)
     assert np.ptp(distance) > 0.5
-    for part in (near, ~near):
+    for part in (is_near, ~is_near):
         assert scaled[part].std() == pytest.approx(1e-3, rel=5.0 / np.sqrt(2.0 * part.sum()))
 
 
@@ -227,7 +227,7 @@ def test_the_cell_says_which_of_its_sensors_measure_poses(tmp_path):
     assert np.isnan(both.measurements.orientation[~posed]).all()
     found = remaster_ros.fit(both)
     truth = json.loads((tmp_path / 'both' / 'truth.json').read_text())
-    true = np.radians([one['offset_deg'] for one in truth['joint_offsets']])
+    true = np.radians([row['offset_deg'] for row in truth['joint_offsets']])
     known = found.identifiable
     off = (found.joint_offsets - true)[known] / found.joint_offsets_std[known]
     print(off)

@@ -116,9 +116,9 @@ def test_intervals_hold_as_often_as_they_say(made, sessions):
         errors.append(1e3 * (fit.joint_offsets - truth.joint_offsets)[SLIDE])
     print(f'held: {np.mean(inside):.4f}, of the slide {np.mean(slides):.4f}')
     print(f'error of the slide, mm: {np.sqrt(np.mean(np.square(errors))):.4f}')
-    for held, count in ((inside, len(inside) // 2), (slides, sessions)):
+    for hits, count in ((inside, len(inside) // 2), (slides, sessions)):
         low, high = binom.ppf((0.5 * ERROR_RATE, 1.0 - 0.5 * ERROR_RATE), count, 0.95) / count
-        assert low <= np.mean(held) <= high
+        assert low <= np.mean(hits) <= high
 
 
 def test_an_effect_of_a_slide_is_hidden_in_metres_and_found(made, tmp_path):

@@ -57,10 +57,10 @@ class Bench:
     def draw(self):
         """Draw what is next; return what a person is told."""
         until = time.monotonic() + 60.0
-        while not (told := self.preview.draw(START, self.peers)):
+        while not (message := self.preview.draw(START, self.peers)):
             assert time.monotonic() < until
             time.sleep(0.01)
-        return told
+        return message
 
     def registered(self):
         self.progress.T_R_N.update(self.tours.rough_places)
@@ -75,11 +75,11 @@ def test_the_plan_is_shown_and_followed_only_once_it_is_confirmed(bench):
     preview = bench.preview
     assert 'it is being drawn' in preview.collect_refusal()
     assert preview.confirm() == (False, preview.refusal())
-    told = bench.draw()
+    message = bench.draw()
     registration = bench.tours.registration()
     name = fingerprint(registration)
-    assert told == preview.collect_refusal()
-    assert told == (
+    assert message == preview.collect_refusal()
+    assert message == (
         f'plan {name} is not confirmed: look at {bench.page}, then call /remaster/confirm and '
         '/remaster/collect'
     )
@@ -184,12 +184,12 @@ def test_only_the_plan_that_a_person_has_seen_is_confirmed(bench):
 
 def test_a_page_that_cannot_be_written_holds_the_arm_and_is_tried_again(bench):
     bench.page.write_text('my own')
-    told = bench.draw()
-    assert told.startswith('the plan cannot be shown: ')
-    assert str(bench.page) in told
+    message = bench.draw()
+    assert message.startswith('the plan cannot be shown: ')
+    assert str(bench.page) in message
     assert not bench.preview.confirm()[0]
     bench.page.unlink()
-    assert bench.preview.collect_refusal() == told
+    assert bench.preview.collect_refusal() == message
     assert 'is not confirmed: look at' in bench.draw()
 
 
