@@ -25,6 +25,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from remaster_ros.calibration.dynamics import ROW_S, TRAVELS_RAD
 from remaster_ros.calibration.estimate import Problem
@@ -70,9 +71,12 @@ MOST_CLOCK_STEPS = 12
 # A gap of more periods is counted only with the period that frames on either side of it have: the
 # median of their gaps is off by some thousandths, which over so many is a tenth of a period.
 LONGEST_COUNTED = 100
-# Of all frames the share whose stamps are within half a period of a constant rate: beyond that the
-# number of a frame is not sure. A few are later where a host was held up.
-AT_A_RATE = 0.99
+# Number of frames whose median delay counts: a host that was held up for less than half of them,
+# 0.4 s at 120 Hz, does not change it.
+DELAY_FRAMES = 101
+# The number of a frame is sure if the rise of the delay is within this share of a period of a
+# whole number: of frames at no constant rate that is one half, and frames at one have this share.
+SURE_PERIODS, AT_A_RATE = 0.25, 0.9
 # Longest step, s: beyond it the tangent is not valid.
 LONGEST_CLOCK_STEP_S = 0.05
 # Largest number of rows of a robust fit for the clocks.
@@ -143,8 +147,9 @@ class _Frames:
     def at_constant_rate(self) -> _Frames | None:
         """Frames with stamps at a constant rate; None if they do not come at one.
 
-        They do if 99 % of the stamps are within half a period of it, each in a period of its own;
-        the others, of a moment at which a host was held up, are left out.
+        A frame's number counts the frames before it and those lost: by so much their delay has
+        risen for good. Frames, or all of a while, may be late. They come at a constant rate if
+        nine tenths of the numbers are sure; the other frames are left out.
         """
         stamps = self.stamps
         gaps = np.diff(stamps)
@@ -163,18 +168,39 @@ class _Frames:
             if square == 0.0:
                 return None
             period = float(here @ times) / square
-        ticks = np.round((stamps - stamps[0]) / period)
-        line = np.polynomial.Polynomial.fit(ticks, stamps, 1)
-        steady = line(ticks)
-        off = np.abs(stamps - steady)
-        # Of several in a period the nearest.
-        order = np.lexsort((off, ticks))
-        nearest = order[np.diff(ticks[order], prepend=-1.0) > 0.0]
-        kept = np.sort(nearest[off[nearest] < 0.5 * period])
-        if len(kept) < AT_A_RATE * len(stamps):
+        index = np.arange(len(stamps))
+        delay = (stamps - stamps[0]) / period - index
+        delay -= np.angle(np.mean(np.exp(2j * np.pi * delay))) / (2.0 * np.pi)
+        median = median_filter(delay, DELAY_FRAMES, mode='nearest')
+        # What is lost does not come back, as a delay does.
+        rising = _rising(median)
+        lost = np.round(rising)
+        kept = np.abs(rising - lost) < SURE_PERIODS
+        if np.mean(kept) < AT_A_RATE:
             return None
-        scatter_s = float(np.std(stamps[kept] - steady[kept]))
-        return _Frames(steady[kept], self.positions[kept], self.markers, scatter_s)
+        ticks = (index + lost)[kept]
+        steady = np.polynomial.Polynomial.fit(ticks, stamps[kept], 1)(ticks)
+        scatter_s = float(np.std(stamps[kept] - steady))
+        if scatter_s > 0.5 * period:
+            return None
+        return _Frames(steady, self.positions[kept], self.markers, scatter_s)
+
+
+def _rising(values: FloatArray) -> FloatArray:
+    """Nearest sequence, by least squares, that never falls, (n,): pool adjacent violators.
+
+    Ayer et al. (1955), doi:10.1214/aoms/1177728423; SciPy has it from 1.12 on, Ubuntu 24.04 1.11.
+    """
+    pools: list[tuple[float, int]] = []
+    for value in values.tolist():
+        mean, count = value, 1
+        while pools and pools[-1][0] > mean:
+            earlier, number = pools.pop()
+            mean = (earlier * number + mean * count) / (number + count)
+            count += number
+        pools.append((mean, count))
+    means, counts = zip(*pools, strict=True)
+    return np.repeat(means, counts)
 
 
 def _less_mean(values: FloatArray, run: IntArray) -> FloatArray:

@@ -149,14 +149,16 @@ def test_frames_of_no_constant_rate_keep_their_stamps():
     assert frames(np.cumsum(rng.exponential(1.0 / 120.0, 1000))) is None
     assert frames(np.cumsum(rng.choice([0.008, 0.013], 1000))) is None
     assert frames(np.array([1.0])) is None
-    # A host that was held up for a moment: its frames come together, and are left out.
+    # A host that was held up for a moment: its frames come together. Nor is a clock's estimate
+    # that wanders by half a period for a second any loss.
     late = regular.copy()
     late[200:206] = late[205] + 1e-5 * np.arange(6)
+    late[600:720] += 4.5e-3
     steady = frames(late)
-    assert len(regular) - 6 <= len(steady.stamps) < len(regular)
-    at = np.searchsorted(regular, steady.stamps - 2e-3)
-    np.testing.assert_allclose(steady.stamps, regular[at], atol=2e-4)
-    assert np.all(np.diff(steady.stamps) > 5e-3)
+    assert len(steady.stamps) > 0.97 * len(regular)
+    # Less the mean delay, which all of them share.
+    off = steady.stamps - regular[np.searchsorted(regular, steady.stamps - 4e-3)]
+    np.testing.assert_allclose(off, np.mean(off), atol=5e-4)
 
 
 def test_the_bend_of_a_path_moves_no_row():
