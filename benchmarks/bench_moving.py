@@ -34,7 +34,7 @@ from remaster_ros.errors import InsufficientDataError
 from remaster_ros.planning.moving_design import design_moving
 from remaster_ros.planning.moving_information import expected_along
 from remaster_ros.planning.travel_time import TravelTime
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray, Session
 

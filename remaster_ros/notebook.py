@@ -43,19 +43,20 @@ class Fit(FitResult):
 
     def __repr__(self) -> str:
         from remaster_ros.reports.fit_json import fit_content
-        from remaster_ros.reports.sentences import fit_lines
+        from remaster_ros.reports.result_lines import fit_lines
 
         return '\n'.join(fit_lines(fit_content(self)))
 
     def _repr_html_(self) -> str:
         """First screen of the report of this fit, as HTML."""
-        from remaster_ros.reports.report import fit_html
+        from remaster_ros.reports.fit_page import fit_html
 
         return _first_screen(fit_html(self, {}))
 
     def figures(self) -> dict[str, Figure]:
         """Return the report's figures by name; nothing is written."""
-        from remaster_ros.reports.figures import as_figures, fit_figures
+        from remaster_ros.reports.figure_style import as_figures
+        from remaster_ros.reports.fit_figures import fit_figures
 
         return as_figures(fit_figures(self), self)
 
@@ -88,13 +89,13 @@ class Found(Discovery):
         return cls(**{field.name: getattr(found, field.name) for field in fields(found)})
 
     def __repr__(self) -> str:
-        from remaster_ros.reports.sentences import discovery_lines
+        from remaster_ros.reports.result_lines import discovery_lines
 
         return '\n'.join(discovery_lines(self._content))
 
     def _repr_html_(self) -> str:
         """First screen of the report of this search, as HTML."""
-        from remaster_ros.reports.report import discovery_html
+        from remaster_ros.reports.discovery_page import discovery_html
 
         return _first_screen(discovery_html(self._content, self.fit.session, {}))
 
@@ -107,7 +108,8 @@ class Found(Discovery):
 
     def figures(self) -> dict[str, Figure]:
         """Return the report's figures by name; nothing is written."""
-        from remaster_ros.reports.figures import as_figures, discovery_figures
+        from remaster_ros.reports.discovery_figures import discovery_figures
+        from remaster_ros.reports.figure_style import as_figures
 
         return as_figures(discovery_figures(self), self)
 

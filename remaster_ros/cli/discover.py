@@ -25,7 +25,7 @@ from remaster_ros.reports.discovery_json import read_discovery
 from remaster_ros.reports.fit_json import DISCOVERY_FILE
 from remaster_ros.reports.found_causes import earlier_pairs
 from remaster_ros.reports.result_folder import prepare_folder, save_discovery
-from remaster_ros.reports.sentences import discovery_lines
+from remaster_ros.reports.result_lines import discovery_lines
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.records.reader import read_session
 

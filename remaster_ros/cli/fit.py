@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     from remaster_ros.cli.sessions import read_together
     from remaster_ros.reports.fit_json import FIT_FILE, read_fit
     from remaster_ros.reports.result_folder import prepare_folder, save_fit
-    from remaster_ros.reports.sentences import fit_lines
+    from remaster_ros.reports.result_lines import fit_lines
     from remaster_ros.session.files import undone_on_failure
     from remaster_ros.session.records.priors_file import read_priors
 

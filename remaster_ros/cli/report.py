@@ -14,9 +14,10 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.cli.console import progress_bar, tell
 from remaster_ros.cli.sessions import read_to_fit
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.answer import Answer, parts, read_inputs
+from remaster_ros.reports.answer import Answer
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE
-from remaster_ros.reports.report import PlanFacts, plan_facts, plan_to_dict
+from remaster_ros.reports.plan_facts import PlanFacts, plan_facts, plan_to_dict
+from remaster_ros.reports.report_inputs import parts, read_inputs
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.files import undone_on_failure
 from remaster_ros.session.records.plan_journal import read_plan

@@ -15,8 +15,8 @@ from remaster_ros.compensation.compensator import Compensator
 from remaster_ros.compensation.verification import Visits, verify
 from remaster_ros.demo.configuration_times import ConfigurationTimes
 from remaster_ros.discovery.explain import FoundEffect
+from remaster_ros.reports.result_lines import discovery_lines
 from remaster_ros.reports.schemas import Discovered, Fit
-from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.simulation.chain_arm import tool_points
 from remaster_ros.simulation.expected_findings import causes, describe, named_cause
 from remaster_ros.simulation.hidden_effects import true_parameters

@@ -51,10 +51,12 @@ from remaster_ros.nodes.status import (
     listen,
 )
 from remaster_ros.reports.fit_json import FIT_FILE, REPORT_FILE, read_fit
-from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer, Place
+from remaster_ros.reports.live_connections import Place
+from remaster_ros.reports.live_server import COMMANDS, CONFIRM, Done, LiveServer
 from remaster_ros.reports.live_view import FitFacts, LiveView, PlanPage
 from remaster_ros.reports.plan_page import read_plan_page
-from remaster_ros.reports.robot_scene import robot_scene, scene_to_dict
+from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.types import FloatArray
 

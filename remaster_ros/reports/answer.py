@@ -1,265 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The answer of a report after a fit and a search for causes: action, gain.
-
-Last result: remaining errors.
-"""
+"""Answer of a report after a fit and a search for causes: action, gain and remaining errors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
-import msgspec
 import numpy as np
 
 from remaster_ros.calibration.gauge_words import counted, listed
 from remaster_ros.calibration.noise_check import MEAN_LENGTH
 from remaster_ros.calibration.outliers import LARGEST_SHARE
-from remaster_ros.compensation.export import (
-    APPLY_FOLDER,
-    LAYER_FILE,
-    MODEL_FILE,
-    REMASTER_FILE,
-    URDF_FILE,
-)
-from remaster_ros.compensation.loaded_errors import errors_with_urdf
+from remaster_ros.compensation.export import LAYER_FILE, MODEL_FILE, REMASTER_FILE, URDF_FILE
 from remaster_ros.compensation.mastering import MasteringStep, mastering
 from remaster_ros.discovery.explain import FoundEffect
-from remaster_ros.discovery.words import clock_time
-from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, FIT_LIMIT, read_fit
-from remaster_ros.reports.rows_csv import (
-    AFTER,
-    BEFORE,
-    PREDICTED,
-    PREDICTIONS_FILE,
-    RESIDUALS_FILE,
-    lengths_mm,
-    read_columns,
-)
-from remaster_ros.reports.schemas import (
-    Discovered,
-    Fit,
-    FittedGeometry,
-    JointOffset,
-    Judgement,
-    Loadable,
-)
-from remaster_ros.reports.sentences import (
-    FEW_HELD_OUT,
-    FEW_POSES,
-    NOTICEABLE_GAIN,
-    at_marker,
-    hardly_proven,
-    more_than_noise,
-    not_counted,
-    times_smaller,
-)
-from remaster_ros.session.files import decode_text, read_limited
+from remaster_ros.reports.remaining_errors import Remaining, what_remains
+from remaster_ros.reports.report_inputs import Inputs
+from remaster_ros.reports.schemas import Discovered, JointOffset, Judgement, Mood
+from remaster_ros.reports.sentences import NOTICEABLE_GAIN, not_counted, times_smaller
 from remaster_ros.types import BoolArray, FloatArray, Session
 
-if TYPE_CHECKING:
-    from remaster_ros.session.records.plan_journal import RecordedPlan
-
-# Inputs: a session, its fit, and its discovery if any.
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """Session and results that a report is made of; n rows."""
-
-    session: Session
-    # Contents of fit.json and discovery.json (None without the latter)
-    fit: Fit
-    found: Discovered | None
-    # 3-D error of each row with all offsets at zero, and with those of the fit, (n,)
-    before_mm: FloatArray
-    after_mm: FloatArray
-    causes_mm: FloatArray | None  # Error with the causes as well, (n,); None without causes
-    # Error with the robot model of all lengths, tilts and zero-offsets, (n,); None if no such
-    # model predicts held-out poses better
-    model_mm: FloatArray | None = None
-    model: Path | None = None  # File of that model
-    plan: RecordedPlan | None = None  # Plan of the collection; None if the session has none
-
-    @property
-    def judgement(self) -> Judgement:
-        """Judgement of the fit; the fit has to have one (AssertionError)."""
-        assert isinstance(self.fit.judgement, Judgement)
-        return self.fit.judgement
-
-    @property
-    def gross(self) -> list[int]:
-        """``observation`` of the gross errors, by the discovery or, without one, by the fit.
-
-        By the fit: rows that were not fitted, then held-out rows of `NoiseCheck.gross`.
-        """
-        if self.found is not None:
-            return self.found.noise.outliers
-        checks = self.fit.explained_by_noise
-        held_out = checks.values() if isinstance(checks, dict) else ()
-        return [*self.fit_left_out, *(row for check in held_out for row in check.gross)]
-
-    @cached_property
-    def fit_left_out(self) -> dict[int, str]:
-        """Reason by ``observation`` for each row that was not fitted."""
-        return {row.observation: row.why for row in self.fit.left_out}
-
-    @property
-    def T_R_N(self) -> dict[str, FloatArray]:
-        """Fitted registration of each sensor, (4, 4)."""
-        return {
-            sensor: registration.T_R_N for sensor, registration in self.fit.registration.items()
-        }
-
-
-def located(path: Path) -> Path:
-    """File fit.json or discovery.json at a path, or in a folder.
-
-    Raises InputError if a folder has both or neither.
-    """
-    if not path.is_dir():
-        return path
-    there = [path / name for name in (FIT_FILE, DISCOVERY_FILE) if (path / name).exists()]
-    if len(there) != 1:
-        raise InputError(
-            f'{path}: holds {"both" if there else "neither"} {FIT_FILE} '
-            f'{"and" if there else "nor"} {DISCOVERY_FILE}; give one of the files'
-        )
-    return there[0]
-
-
-def read_inputs(
-    session: Session, fit_path: Path, found_path: Path | None, plan: RecordedPlan | None = None
-) -> Inputs:
-    """Read the results of a session.
-
-    Parameters
-    ----------
-    session
-        Session as read from its folder.
-    fit_path, found_path
-        fit.json and discovery.json, with residuals.csv and predictions.csv in their folders.
-    plan
-        Plan of the session.
-
-    Raises
-    ------
-    InputError
-        Results of another session, or a damaged file; one line naming file and remedy.
-    """
-    fit = read_fit(fit_path)
-    _require_same(session, fit, fit_path, 'fit')
-    residuals = read_columns(fit_path.parent / RESIDUALS_FILE, session, BEFORE + AFTER, 'fit')
-    before_mm, after_mm = lengths_mm(residuals[:, :3]), lengths_mm(residuals[:, 3:])
-    if found_path is None:
-        model, model_mm = _model(session, fit_path, _file_of(fit.geometry), 'fit')
-        return Inputs(session, fit, None, before_mm, after_mm, None, model_mm, model, plan)
-    from remaster_ros.reports.discovery_json import read_discovery
-
-    found = read_discovery(found_path)
-    _require_same(session, found, found_path, 'discover')
-    causes_mm = None
-    if found.effects:
-        path = found_path.parent / PREDICTIONS_FILE
-        predicted = read_columns(path, session, PREDICTED, 'discover')
-        causes_mm = lengths_mm(session.measurements.position - predicted)
-    rows = found.loadable if isinstance(found.loadable, list) else []
-    model, model_mm = _model(
-        session,
-        found_path,
-        ''.join(_file_of(r) for r in rows if r.result == 'geometry'),
-        'discover',
-    )
-    return Inputs(session, fit, found, before_mm, after_mm, causes_mm, model_mm, model, plan)
-
-
-def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
-    """File of a loadable result; '' if there is none."""
-    return '' if isinstance(source, msgspec.UnsetType) else source.file
-
-
-def _model(
-    session: Session, result: Path, file: str, verb: str
-) -> tuple[Path | None, FloatArray | None]:
-    """Path of a result's robot model, and the errors of all rows with it, mm, (n,).
-
-    Both None if ``file`` (as the result names it) is ''. ``result``: path of the result; ``verb``:
-    command that writes it. Raises InputError if the model is missing.
-    """
-    if not file:
-        return None, None
-    path = result.parent / APPLY_FOLDER / MODEL_FILE
-    data = read_limited(path, FIT_LIMIT, f'{verb} again, which writes it')
-    return path, errors_with_model_mm(session, decode_text(data, path))
-
-
-def all_taken_out(found: Discovered | None) -> bool:
-    """Whether there are causes, not 'undetermined', all certain errors of the measurement."""
-    return (
-        found is not None
-        and found.verdict != 'undetermined'
-        and bool(found.effects)
-        and all(effect.is_taken_out for effect in found.effects)
-    )
-
-
-def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """3-D error of each row with the robot model of a URDF (text), mm, (n,).
-
-    As of `errors_with_urdf`: registrations and markers are fitted, offsets are 0.
-    """
-    return lengths_mm(errors_with_urdf(session, urdf))
-
-
-def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
-    """Raise InputError for the result of other data, or of a version that lacks needed keys.
-
-    ``verb``: command of the remedy.
-    """
-    if (
-        not isinstance(result.session, msgspec.Struct)
-        or not isinstance(result.judgement, msgspec.Struct)
-        or (isinstance(result, Discovered) and not all(e.title for e in result.effects))
-    ):
-        raise InputError(f'{path}: of an earlier version; {verb} this session again')
-    if result.session.observations_sha256 != session.observations_sha256:
-        raise InputError(
-            f'{path}: of other data than this session (observations.csv has another SHA-256); '
-            f'{verb} this session'
-        )
-
-
-def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Paths of fit.json and of discovery.json among at most two paths; None if absent.
-
-    Raises
-    ------
-    InputError
-        Two files of one kind, or a file of another name.
-    """
-    found: dict[str, Path] = {}
-    for path in map(located, paths):
-        if path.name not in (FIT_FILE, DISCOVERY_FILE):
-            missing = '' if path.exists() else 'there is no such file or folder; '
-            raise InputError(
-                f'{path}: {missing}give {FIT_FILE} or {DISCOVERY_FILE}, or the folder of '
-                'one of them'
-            )
-        if path.name in found:
-            raise InputError(f'{path}: two files {path.name}; give one of each')
-        found[path.name] = path
-    return found.get(FIT_FILE), found.get(DISCOVERY_FILE)
-
-
-# Action, and its gain.
-
 ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, MODEL_FILE)
-Mood = Literal['good', 'caution', 'bad']
 
 
 class Stage(NamedTuple):
@@ -440,6 +203,16 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
     return ~np.isin(m.observation, list(inputs.fit_left_out)), False
 
 
+def all_taken_out(found: Discovered | None) -> bool:
+    """Whether there are causes, not 'undetermined', all certain errors of the measurement."""
+    return (
+        found is not None
+        and found.verdict != 'undetermined'
+        and bool(found.effects)
+        and all(effect.is_taken_out for effect in found.effects)
+    )
+
+
 def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
     """Title, and errors of all rows, mm, (n,), at each stage: today, zero-offsets, then the rest.
 
@@ -568,146 +341,4 @@ def _headline(
         f'{action}: the mean error on {poses_text} falls from {before.mean:.3f} mm to '
         f'{after.mean:.3f} '
         f'mm, {times_smaller(before.mean, after.mean)}.{note}'
-    )
-
-
-# Errors that the action leaves: causes, gross errors, data that disagree, and the remedy.
-
-# Fewer gross errors than these, in number and share, are in the table of left-out rows only.
-FEWEST_GROSS, LEAST_SHARE = 3, 0.01
-# Stands in place of a remedy that is a file if the file does not belong to the action.
-NO_FILE = (
-    'No robot model beside this page holds it: correcting it brings no noticeable gain beside the '
-    'zero-offsets, or the page says to set nothing.'
-)
-# Numbers of causes, and of sizes of each, on the first screen; all of them are listed below.
-MOST_NAMED, MOST_SIZES = 4, 2
-
-
-# Name of an error if nothing shows how large the noise is, or too little was held out.
-NOISE_UNKNOWN = 'May be sensor noise alone'
-
-
-class Remaining(NamedTuple):
-    """An error that the action leaves: name, size in words, and remedy."""
-
-    what: str
-    size: str
-    remedy: str
-
-    @property
-    def sentence(self) -> str:
-        """'Name: size. Remedy' as one text; without size or remedy these parts are left out."""
-        size = self.size.rstrip('.')
-        return f'{self.what}{": " if size else ""}{size}. {self.remedy}'.rstrip()
-
-
-def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
-    """Errors that the action leaves, the causes first; at least one entry.
-
-    ``loads_model``: whether the action is to load the robot model, which takes its causes out;
-    ``held_out``: whether poses were held out.
-    """
-    found, judgement = inputs.found, inputs.judgement
-    rows = [] if found is None else _of_discovery(found, loads_model)
-    if found is None and (lines := judgement.findings or judgement.doubts):
-        few = any(line.startswith(FEW_POSES) for line in judgement.doubts)
-        search = (
-            'Search for its cause: remaster discover SESSION --out DIR, then give DIR to '
-            'remaster report.'
-        )
-        rows.append(
-            Remaining(
-                'More than noise' if judgement.findings else NOISE_UNKNOWN,
-                lines[0],
-                ('Measure more poses first, and fit again.' if few else search)
-                if judgement.findings
-                else '',
-            )
-        )
-    elif found is not None and not rows:
-        # Causes have answered the findings of the fit without them.
-        finding = more_than_noise(found)
-        if not finding and not found.effects:
-            finding = next(iter(judgement.findings), '')
-        if finding:
-            rows.append(
-                Remaining(
-                    NOISE_UNKNOWN if FEW_HELD_OUT in finding else 'More than noise',
-                    f'{finding.rstrip(".")}. No cause that was tried explains it',
-                    'Look at the largest errors below; measure again, with references in between.',
-                )
-            )
-    if (gross := _gross(inputs)) is not None:
-        rows.append(gross)
-    rows += [Remaining('The data disagree', line, '') for line in judgement.disagreements]
-    if not held_out:
-        rows.append(
-            Remaining('Not proven', 'no poses were held out', 'Measure some more, and fit again.')
-        )
-    elif isinstance(inputs.fit.session, msgspec.Struct) and (
-        words := hardly_proven(inputs.fit.session.validation.poses)
-    ):
-        rows.append(Remaining('Hardly proven', words, ''))
-    if not rows:
-        words = (
-            'no cause that this session can show explains more of what is left than chance does'
-            if found is not None
-            else 'what is left is what noise explains'
-        )
-        rows.append(Remaining('Noise', '. '.join([words, *judgement.doubts[:1]]), ''))
-    return rows
-
-
-def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
-    """Causes that remain, and errors without a cause.
-
-    At most 4 causes (`MOST_NAMED`); the smaller ones share one entry.
-    """
-    rows: list[Remaining] = []
-    stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
-    for effect in stay[:MOST_NAMED]:
-        size = '; '.join(effect.sizes)
-        if not 0 < len(effect.sizes) <= MOST_SIZES and not np.isnan(effect.size_m):
-            size = at_marker(effect.size_m)
-        remedy = NO_FILE if effect.in_robot_model else effect.remedy
-        rows.append(Remaining(effect.title, size, remedy))
-    if more := stay[MOST_NAMED:]:
-        largest = np.nanmax([effect.size_m for effect in more])
-        size = f'up to {at_marker(largest)}'
-        rows.append(Remaining(counted(len(more), 'smaller cause'), size, 'See below.'))
-    if found.verdict == 'undetermined':
-        remedy = 'Measure what the look-alikes below call for.'
-        rows.append(Remaining('Undecided', 'another explanation fits as well', remedy))
-    if isinstance(found.unexplained, list):
-        rows += [
-            Remaining('Unexplained', f'{1e3 * error.size_m:.3f} mm RMS', error.next)
-            for error in found.unexplained
-        ]
-    return rows
-
-
-def _gross(inputs: Inputs) -> Remaining | None:
-    """Number, sensors and time of the gross errors; None if there are few.
-
-    Few: below 3 (`FEWEST_GROSS`) or below 1 % of all readings (`LEAST_SHARE`).
-    """
-    session, m = inputs.session, inputs.session.measurements
-    rows = np.isin(m.observation, inputs.gross)
-    if rows.sum() < max(FEWEST_GROSS, LEAST_SHARE * len(m)):
-        return None
-    sensors = listed([session.sensor_names[i] for i in np.unique(m.sensor[rows])])
-    first, last = m.stamp_s[rows].min(), m.stamp_s[rows].max()
-    when = f'configurations {m.configuration[rows].min()} to {m.configuration[rows].max()}'
-    if session.timed:
-        start = m.stamp_s.min()
-        when += f', {(first - start) / 60.0:.1f} to {(last - start) / 60.0:.1f} min'
-        if clock := clock_time(float(first)):
-            when += f' after the first reading, from {clock} on'
-        else:
-            when += ' after the first reading'
-    return Remaining(
-        'Gross errors',
-        f'{rows.sum()} of {len(m)} readings, of {sensors}: {when}',
-        'Find out what was moved or hidden then.',
     )

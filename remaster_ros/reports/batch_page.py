@@ -12,8 +12,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 from remaster_ros.compensation.checking import ALARM, change
+from remaster_ros.reports.fit_judgement import without_search
 from remaster_ros.reports.pages import page
-from remaster_ros.reports.sentences import without_search
 from remaster_ros.session.files import write_atomically
 from remaster_ros.types import FloatArray
 

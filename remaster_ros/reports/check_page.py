@@ -40,7 +40,7 @@ def write_check_page(
     InputError
         The file cannot be written.
     """
-    from remaster_ros.reports.figures import as_svg
+    from remaster_ros.reports.figure_style import as_svg
 
     trend: Trend = content, series_m, names
     drawing = as_svg({'trend': _draw}, trend)['trend']
@@ -56,7 +56,7 @@ def _draw(trend: Trend) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    from remaster_ros.reports.figures import AFTER, BEFORE, WIDTH_IN
+    from remaster_ros.reports.figure_style import AFTER, BEFORE, WIDTH_IN
 
     content, x_m, names = trend
     shown = [i for i, joint in enumerate(content['joints']) if joint['detectable_mm'] is not None]

@@ -15,6 +15,7 @@ from remaster_ros.discovery.confirmation import Confirmation
 from remaster_ros.discovery.decision import Decision
 from remaster_ros.discovery.discover import Discovery
 from remaster_ros.reports import schemas
+from remaster_ros.reports.discovery_judgement import judgement
 from remaster_ros.reports.fit_json import (
     DISCOVERY_FILE,
     clocks_content,
@@ -24,7 +25,6 @@ from remaster_ros.reports.fit_json import (
 )
 from remaster_ros.reports.loadable import loadable
 from remaster_ros.reports.schemas import Discovered
-from remaster_ros.reports.sentences import judgement
 from remaster_ros.session.json_records import checked
 from remaster_ros.version import __version__
 

@@ -13,18 +13,15 @@ import numpy as np
 from msgspec import UNSET, structs
 
 from remaster_ros.calibration.records import Robot
-from remaster_ros.compensation.export import (
-    APPLY_FOLDER,
-    MODEL_FILE,
-)
+from remaster_ros.compensation.export import APPLY_FOLDER, MODEL_FILE
 from remaster_ros.discovery.geometry_model import GeometryModel
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import quaternion_xyzw
 from remaster_ros.reports import schemas
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.reports.loadable import geometry_of, uncertainty
 from remaster_ros.reports.rows_csv import RESIDUALS_FILE
-from remaster_ros.reports.sentences import verdict
 from remaster_ros.session.files import read_limited
 from remaster_ros.session.json_records import Record, checked, decoded, format_of
 from remaster_ros.types import FloatArray, Session

@@ -1,4 +1,4 @@
-// Shows a fit (reports/report.py): some of the arm's configurations, what was measured, its errors.
+// Shows a fit (reports/fit_page.py): some of the arm's configurations, what was measured, its errors.
 
 function showFit(view) {
   const element = (id) => document.getElementById(id);

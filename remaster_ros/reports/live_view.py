@@ -29,6 +29,23 @@ STOP_LABEL = 'Stop the collection'
 STOP_NOTE = (
     'No emergency stop: it asks the planner over the network. In danger use the red button.'
 )
+SILENT_S = 3.0
+"""Time without a message after which a node counts as gone, s."""
+LONGEST_TEXT = 400
+LONGEST_DESCRIPTION = 4000
+"""Characters of a plan's description: those of this planner have some 500, behind a fold."""
+MOST_NODES = 30
+MOST_MESSAGES = 40
+MOST_POINTS = 400
+LONGEST_WAY = 200
+UNDETERMINED_RAD = 0.0873
+"""Std from which on an offset counts as undetermined, 5 degrees (22 mm for a prismatic joint): its
+prior in the fit."""
+SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
+SHOWN_PLAN = ('plan_page', 'plan_shown', 'confirmed')
+_PLAN_NAME = re.compile('[0-9a-f]{8}')
+PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
+NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
 
 
 @dataclass(frozen=True)
@@ -48,25 +65,6 @@ class FitFacts:
     unidentifiable: frozenset[str] = frozenset()  # Joints whose offset is not identifiable
     # Fitted position of each marker in the tool frame, m, (3,)
     markers: Mapping[str, FloatArray] = field(default_factory=dict)
-
-
-SILENT_S = 3.0
-"""Time without a message after which a node counts as gone, s."""
-LONGEST_TEXT = 400
-LONGEST_DESCRIPTION = 4000
-"""Characters of a plan's description: those of this planner have some 500, behind a fold."""
-MOST_NODES = 30
-MOST_MESSAGES = 40
-MOST_POINTS = 400
-LONGEST_WAY = 200
-UNDETERMINED_RAD = 0.0873
-"""Std from which on an offset counts as undetermined, 5 degrees (22 mm for a prismatic joint): its
-prior in the fit."""
-SHOWN_COUNTS = ('phase', 'poses_done', 'poses', 'configurations_done', 'configurations')
-SHOWN_PLAN = ('plan_page', 'plan_shown', 'confirmed')
-_PLAN_NAME = re.compile('[0-9a-f]{8}')
-PLANNER, BRIDGE, RECORDER, OPTIMIZER = 'pose_planner', 'robot_bridge', 'recorder', 'optimizer'
-NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
 
 
 @dataclass

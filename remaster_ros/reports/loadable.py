@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from remaster_ros.discovery.discover import Discovery
     from remaster_ros.discovery.explain import FoundEffect
 
+_ALONE = 'only zero-offsets are corrected here'
+
 
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
@@ -156,9 +158,6 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
     described = compensation_of(discovery, widening)
     files[COMPENSATION_FILE] = written(described, discovery.fit.session, 'discover', result_sha256)
     return files
-
-
-_ALONE = 'only zero-offsets are corrected here'
 
 
 def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:

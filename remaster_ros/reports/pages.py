@@ -19,13 +19,8 @@ from remaster_ros.calibration.predictions import Coverage
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.effects.unnamed import EFFECT as NO_NAME
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
-from remaster_ros.discovery.words import (
-    p_value_text,
-    percent,
-    probability_text,
-    shown,
-)
-from remaster_ros.reports.figures import GRID, INK, PAPER
+from remaster_ros.discovery.words import p_value_text, percent, probability_text, shown
+from remaster_ros.reports.figure_style import GRID, INK, PAPER
 from remaster_ros.reports.fit_json import REPORT_FILE
 from remaster_ros.reports.schemas import MeasuredSession
 from remaster_ros.reports.sentences import (

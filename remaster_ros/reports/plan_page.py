@@ -21,7 +21,8 @@ from remaster_ros.planning.collection_plan import FITTED, CollectionPlan
 from remaster_ros.planning.moving_information import OWN_M
 from remaster_ros.planning.tour_order import REFERENCE, REGISTRATION
 from remaster_ros.reports.plan_json import HELD_OUT, minutes_text, missed_goal, slides_in_rms
-from remaster_ros.reports.robot_scene import RobotScene, scene_to_dict, view_script
+from remaster_ros.reports.robot_scene import RobotScene
+from remaster_ros.reports.scene_view import scene_to_dict, view_script
 from remaster_ros.session.files import make_folder, undone_on_failure, write_atomically
 from remaster_ros.version import __version__
 

@@ -113,7 +113,7 @@ def save_fit(result: FitResult, folder: str | os.PathLike[str], figures: bool = 
         _remove_report(folder)
         return folder / FIT_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.report import write_fit_report
+    from remaster_ros.reports.fit_page import write_fit_report
 
     return write_fit_report(result, folder)
 
@@ -158,7 +158,7 @@ def save_discovery(
         _remove_report(folder)
         return folder / DISCOVERY_FILE
     # Matplotlib and the templates take a second to import: only where a report is made.
-    from remaster_ros.reports.report import write_discovery_report
+    from remaster_ros.reports.discovery_page import write_discovery_report
 
     return write_discovery_report(discovery, content, folder)
 

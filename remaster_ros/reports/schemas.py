@@ -33,6 +33,8 @@ from remaster_ros.kinematics.serial_chain import LEVER_M
 
 FIT_FORMAT = 'remaster-fit/1'
 DISCOVERY_FORMAT = 'remaster-discovery/1'
+# Judgement of a result: green, amber or red.
+Mood = Literal['good', 'caution', 'bad']
 
 
 class Counts(Struct):
@@ -166,7 +168,7 @@ class Judgement(Struct):
     each other.
     """
 
-    mood: Literal['good', 'caution', 'bad']
+    mood: Mood
     headline: str
     points: list[str] = []
     findings: list[str] = []

@@ -16,10 +16,12 @@ from worlds.played_collection import CELL, CHAIN, PlayedCollection
 
 from remaster_ros.planning.collection_plan import look_ahead
 from remaster_ros.planning.tour_planner import TourPlanner
-from remaster_ros.reports.live_server import LiveServer, Place
+from remaster_ros.reports.live_connections import Place
+from remaster_ros.reports.live_server import LiveServer
 from remaster_ros.reports.live_view import PlanPage
 from remaster_ros.reports.plan_page import plan_page, read_plan_page, write_plan_page
-from remaster_ros.reports.robot_scene import robot_scene, scene_to_dict
+from remaster_ros.reports.robot_scene import robot_scene
+from remaster_ros.reports.scene_view import scene_to_dict
 
 
 class Empty(BaseHTTPRequestHandler):

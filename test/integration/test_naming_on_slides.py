@@ -22,7 +22,7 @@ from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.figures import causes
+from remaster_ros.reports.discovery_figures import causes
 from remaster_ros.reports.result_folder import save_discovery
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.simulation.effect_sampling import EffectSpec, draw_effect

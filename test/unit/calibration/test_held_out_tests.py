@@ -13,7 +13,7 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.left_out import Contrasts, held_out_tests, left_out_distances
 from remaster_ros.calibration.residual_structure import StructureTest
 from remaster_ros.calibration.smooth_functions import whitened
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.types import FloatArray, Session
 
 NONE = np.zeros(0, np.int64)

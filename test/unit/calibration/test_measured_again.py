@@ -11,7 +11,8 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.measured_again import SAME_RAD, MeasuredAgain
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.reports.discovery_json import discovery_content
-from remaster_ros.reports.sentences import judgement, verdict
+from remaster_ros.reports.discovery_judgement import judgement
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.types import Measurements, Session
 
 

@@ -15,7 +15,7 @@ from remaster_ros.calibration.noise_check import (
     NoiseCheck,
     check_noise,
 )
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.types import Measurements
 
 POSES, EACH = 40, 5

@@ -13,7 +13,7 @@ from remaster_ros import simulate
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.predictions import Coverage, predict
 from remaster_ros.calibration.result import FitResult
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.fit_judgement import verdict
 
 SIGMA_M, POSE_SIGMA_M = 1e-4, 2e-4
 

@@ -12,7 +12,7 @@ from remaster_ros.calibration.orientation_accuracy import METRICS
 from remaster_ros.cli.accuracy import table
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_rpy, quaternion_xyzw
-from remaster_ros.reports.report import accuracy_rows
+from remaster_ros.reports.fit_page import accuracy_rows
 from remaster_ros.reports.schemas import Accuracy
 
 SIGMA_RAD = 0.2e-3

@@ -13,7 +13,7 @@ from worlds.sliding_cells import LWR, rail, telescope
 
 from remaster_ros.calibration.fit import fit_session
 from remaster_ros.reports.fit_json import fit_content
-from remaster_ros.reports.sentences import fit_lines
+from remaster_ros.reports.result_lines import fit_lines
 
 ERROR_RATE = 1e-3
 # What slides is the first joint, one amid the arm, and the last one.

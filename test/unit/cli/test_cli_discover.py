@@ -13,8 +13,8 @@ from remaster_ros.discovery.confirmation import Compared, Confirmation, Confirme
 from remaster_ros.discovery.explain import FoundEffect, LookAlike
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.discovery.thinning import Thinning
+from remaster_ros.reports.result_lines import discovery_lines
 from remaster_ros.reports.schemas import Discovered, Judgement, Loadable
-from remaster_ros.reports.sentences import discovery_lines
 from remaster_ros.session.json_records import checked
 
 EFFECT = FoundEffect(

@@ -18,9 +18,9 @@ from remaster_ros.compensation.file import read_compensation
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.discovery.geometry_model import geometry_model
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports.answer import errors_with_model_mm
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.loadable import model_text
+from remaster_ros.reports.report_inputs import errors_with_model_mm
 from remaster_ros.reports.result_folder import save_discovery, save_fit
 from remaster_ros.types import FloatArray, Priors, Session
 

@@ -13,7 +13,7 @@ from remaster_ros.calibration.result import FitResult
 from remaster_ros.discovery.discover import discover_session
 from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.reports.fit_json import fit_content
-from remaster_ros.reports.sentences import verdict
+from remaster_ros.reports.fit_judgement import verdict
 from remaster_ros.types import Session
 
 

@@ -11,7 +11,7 @@ from remaster_ros.discovery.discover import Discovery, discover_session
 from remaster_ros.discovery.geometry_model import geometry_model
 from remaster_ros.reports.discovery_json import discovery_content
 from remaster_ros.reports.loadable import loadable
-from remaster_ros.reports.sentences import discovery_lines
+from remaster_ros.reports.result_lines import discovery_lines
 
 
 def test_only_a_certain_error_of_the_measurement_is_taken_out(monkeypatch):

@@ -21,7 +21,8 @@ from remaster_ros.importing.joint_motion import JointMotion
 from remaster_ros.importing.moving import _Frames, effective_turns, with_proof
 from remaster_ros.importing.standstills import Stream
 from remaster_ros.reports.fit_json import fit_content, read_fit
-from remaster_ros.reports.sentences import motion_rows, verdict
+from remaster_ros.reports.fit_judgement import verdict
+from remaster_ros.reports.fit_page import motion_rows
 from remaster_ros.session.records.reader import read_session, write_session
 from remaster_ros.types import Session
 

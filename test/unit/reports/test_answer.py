@@ -12,18 +12,14 @@ from worlds.discovery_files import discovery_content, effect
 
 from remaster_ros.compensation.export import exports
 from remaster_ros.errors import InputError
-from remaster_ros.reports.answer import (
-    NO_FILE,
-    Inputs,
-    answer_of,
-    errors_with_model_mm,
-    parts,
-    read_inputs,
-)
-from remaster_ros.reports.figures import Subject
+from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_figures import Subject
+from remaster_ros.reports.discovery_judgement import more_than_noise
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.pages import law
+from remaster_ros.reports.remaining_errors import NO_FILE
 from remaster_ros.reports.report import answer_html, checked_svg, require_ready, worst_rows
+from remaster_ros.reports.report_inputs import Inputs, errors_with_model_mm, parts, read_inputs
 from remaster_ros.reports.result_folder import save_fit
 from remaster_ros.reports.schemas import (
     Discovered,
@@ -32,7 +28,6 @@ from remaster_ros.reports.schemas import (
     MeasuredSession,
     PredictedRegions,
 )
-from remaster_ros.reports.sentences import more_than_noise
 
 STEP = {'driver': 'time', 'form': 'step', 'name': 'unnamed', 'moment_s': 455.0}
 SLIP = {**STEP, 'joints': [3], 'title': 'Joint 3 slipped'}

@@ -12,17 +12,12 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan, PlannedPose
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, Tour
-from remaster_ros.reports.answer import Inputs, answer_of
-from remaster_ros.reports.figures import Subject, draw_answer, planned
+from remaster_ros.reports.answer import answer_of
+from remaster_ros.reports.answer_figures import Subject, draw_answer, planned
 from remaster_ros.reports.fit_json import fit_content
-from remaster_ros.reports.report import (
-    answer_html,
-    copy_plan,
-    drawn_plan,
-    plan_facts,
-    plan_to_dict,
-    require_ready,
-)
+from remaster_ros.reports.plan_facts import copy_plan, drawn_plan, plan_facts, plan_to_dict
+from remaster_ros.reports.report import answer_html, require_ready
+from remaster_ros.reports.report_inputs import Inputs
 from remaster_ros.reports.schemas import Fit, Judgement
 from remaster_ros.session.records.plan_journal import ExpectationRecord, RecordedPlan
 

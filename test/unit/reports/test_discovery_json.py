@@ -28,20 +28,16 @@ from remaster_ros.discovery.effects.splines import Curve
 from remaster_ros.discovery.gain import Gain
 from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
-from remaster_ros.reports import discovery_json, figures
+from remaster_ros.reports import discovery_figures, discovery_json
 from remaster_ros.reports import loadable as loadables
 from remaster_ros.reports.discovery_json import discovery_content, read_discovery
+from remaster_ros.reports.discovery_judgement import judgement
+from remaster_ros.reports.discovery_page import discovery_html
 from remaster_ros.reports.loadable import loadable, model_text
-from remaster_ros.reports.report import discovery_html
 from remaster_ros.reports.result_folder import save_discovery
+from remaster_ros.reports.result_lines import discovery_lines
 from remaster_ros.reports.schemas import Discovered
-from remaster_ros.reports.sentences import (
-    coverage_words,
-    discovery_lines,
-    judgement,
-    load_words,
-    size_words,
-)
+from remaster_ros.reports.sentences import coverage_words, load_words, size_words
 from remaster_ros.types import Measurements
 
 
@@ -139,12 +135,12 @@ def test_curves_of_a_large_session_are_drawn_at_the_rows_that_were_searched(save
 
     def curve():
         # Points of what is left, then the curve.
-        _, line = figures.causes(found).axes[0].lines
+        _, line = discovery_figures.causes(found).axes[0].lines
         return line.get_xdata(), line.get_ydata()
 
     x, y = curve()
     assert len(x) == len(found.residuals.context)
-    monkeypatch.setattr(figures, 'MOST_DRAWN', 0)
+    monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
     few_x, few_y = curve()
     assert len(few_x) == len(found.residuals) < len(x)
     # A gap in the line begins with what was measured, so the two differ at gaps alone.
@@ -184,7 +180,7 @@ def test_a_free_curve_is_drawn_where_it_was_measured_with_a_band_that_opens(save
         solution=solution,
         fit=replace(found.fit, theta_names=names, theta_draws=draws[None]),
     )
-    (axes,) = figures.causes(drawn).axes
+    (axes,) = discovery_figures.causes(drawn).axes
     _, line = axes.lines
     at, heights = np.radians(line.get_xdata()), line.get_ydata()
     gap = np.abs(at - np.median(q)) < 0.2
@@ -231,7 +227,7 @@ def test_noise_along_the_line_of_sight_is_drawn_by_sensor(saved):
         empty=replace(found.empty, noise=noise),
         solution=replace(found.solution, noise=noise),
     )
-    figure = figures.gain(drawn)
+    figure = discovery_figures.gain(drawn)
     widths = [bar.get_width() for bar in figure.axes[1].patches]
     np.testing.assert_allclose(widths, 2 * [0.6 * np.sqrt(2.0 / 3.0), 0.3 / np.sqrt(3.0)])
 
@@ -518,7 +514,7 @@ def test_causes_are_drawn(scenes, scene, tmp_path):
 def test_every_verdict_has_its_page(scenes, verdict, scene, tmp_path):
     found = replace(scenes[scene], verdict=verdict)
     page, mood, _ = shown(found, tmp_path, figures=False)
-    assert ('causes' in figures.discovery_figures(found)) == (scene == 'bent')
+    assert ('causes' in discovery_figures.discovery_figures(found)) == (scene == 'bent')
     assert mood == ('good' if verdict in ('none', 'effects') else 'caution')
     assert 'id="gain"' in page
 
@@ -551,7 +547,7 @@ def test_a_posterior_that_is_only_approximate_is_never_green(scenes, tmp_path):
 
 
 def test_one_cause_without_a_curve_is_a_thin_bar_beside_the_noise(scenes):
-    (axes,) = [ax for ax in figures.causes(scenes['scale']).axes if ax.patches]
+    (axes,) = [ax for ax in discovery_figures.causes(scenes['scale']).axes if ax.patches]
     low, high = sorted(axes.get_ylim())
     assert len(axes.patches) >= 2
     assert all(bar.get_height() < 0.15 * (high - low) for bar in axes.patches)
@@ -562,7 +558,7 @@ def test_no_bin_and_no_line_lies_where_nothing_was_measured():
     rng = np.random.default_rng(5)
     x = np.concatenate((rng.uniform(-100, -60, 70), rng.uniform(50, 90, 30)))
     ax = Figure().subplots()
-    figures._binned(ax, x, rng.normal(size=100), 'black')
+    discovery_figures._binned(ax, x, rng.normal(size=100), 'black')
     assert len(ax.containers) == 2
     for container in ax.containers:
         places = container[0].get_xdata()
@@ -577,10 +573,10 @@ def test_a_wave_has_no_band_where_nothing_was_measured(scenes, monkeypatch):
     rows = np.flatnonzero(np.abs(q - middle) > 25.0)
     shown = replace(discovery, residuals=data.only(np.intersect1d(rows, data.rows.source)))
     # Drawn at the rows that were searched.
-    monkeypatch.setattr(figures, 'MOST_DRAWN', 0)
+    monkeypatch.setattr(discovery_figures, 'MOST_DRAWN', 0)
     ax = Figure().subplots()
     (candidate,) = discovery.groups[0]
-    figures._cause(ax, shown, candidate)
+    discovery_figures._cause(ax, shown, candidate)
     (band,) = ax.collections
     sides = [path.vertices[:, 0] for path in band.get_paths()]
     assert len(sides) >= 2

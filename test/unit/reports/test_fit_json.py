@@ -24,10 +24,10 @@ from remaster_ros.errors import InputError
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import matrix_from_quaternion_xyzw, matrix_from_rpy
 from remaster_ros.reports.fit_json import fit_content, joint_offsets_of, read_fit
+from remaster_ros.reports.fit_page import fit_html
 from remaster_ros.reports.loadable import geometry_of
-from remaster_ros.reports.report import fit_html
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
-from remaster_ros.reports.sentences import fit_lines
+from remaster_ros.reports.result_lines import fit_lines
 
 
 def test_fit_json_is_the_fit(fit_result, tmp_path):

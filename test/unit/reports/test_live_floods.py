@@ -18,15 +18,15 @@ from collections import deque
 
 import pytest
 
-from remaster_ros.reports import live_server
-from remaster_ros.reports.live_server import MOST, MOST_EACH, REQUEST_S
+from remaster_ros.reports import live_connections
+from remaster_ros.reports.live_connections import MOST, MOST_EACH, REQUEST_S
 
 TOKEN = 'T' * 43
 # More than a process may have files open by default.
 FLOOD = 1130
 SERVER = f"""
 import sys, threading
-from remaster_ros.reports.live_server import Place
+from remaster_ros.reports.live_connections import Place
 from remaster_ros.reports.live_server import LiveServer
 server = LiveServer(Place(), {TOKEN!r}, b'{{}}', lambda name, done: done(True, 'done'))
 server.publish({{'seen': 'a', 'confirmation': None}})
@@ -228,12 +228,12 @@ def test_a_full_pipe_is_not_waited_for(monkeypatch):
     os.set_blocking(write, True)
     with os.fdopen(write, 'w') as pipe:
         monkeypatch.setattr(sys, 'stderr', pipe)
-        rarely = live_server._RareHandler()
+        rarely = live_connections._RareHandler()
         rarely.note('a line')
         rarely.note('another')
         # Now somebody reads.
         os.read(read, 1 << 20)
-        monkeypatch.setattr(live_server, 'LINE_EVERY_S', 0.0)
+        monkeypatch.setattr(live_connections, 'LINE_EVERY_S', 0.0)
         rarely._next_s = 0.0
         rarely.note('the next')
         assert os.read(read, 1000) == b'live page: the next (1 more since the last such line)\n'

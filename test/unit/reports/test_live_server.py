@@ -13,7 +13,8 @@ import pytest
 
 from remaster_ros.errors import InputError
 from remaster_ros.reports import live_server
-from remaster_ros.reports.live_server import COMMANDS, SEEN_FIRST, LiveServer, Place
+from remaster_ros.reports.live_connections import Place
+from remaster_ros.reports.live_server import COMMANDS, SEEN_FIRST, LiveServer
 
 TOKEN = 'T' * 43
 

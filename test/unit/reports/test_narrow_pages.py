@@ -4,7 +4,7 @@
 import pytest
 from rigs.browser import Browser
 
-from remaster_ros.reports.report import fit_html
+from remaster_ros.reports.fit_page import fit_html
 
 WIDTH = 390
 

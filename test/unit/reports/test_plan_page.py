@@ -19,7 +19,7 @@ from remaster_ros.cli import main as cli
 from remaster_ros.cli import plan as plan_verb
 from remaster_ros.planning import moving_design
 from remaster_ros.reports.plan_page import write_plan_page
-from remaster_ros.reports.robot_scene import view_script
+from remaster_ros.reports.scene_view import view_script
 from remaster_ros.session.cells.workcell import read_cell
 
 FEW = ('--poses', '12', '--validation', '8')

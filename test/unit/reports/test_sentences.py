@@ -12,15 +12,10 @@ from remaster_ros.calibration.fit import fit_session
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import ResidualStructure, StructureTest
 from remaster_ros.reports.fit_json import fit_content
-from remaster_ros.reports.report import fit_html
-from remaster_ros.reports.sentences import (
-    METRICS,
-    as_drawn,
-    fit_lines,
-    load_words,
-    loadable_of_fit,
-    verdict,
-)
+from remaster_ros.reports.fit_judgement import verdict
+from remaster_ros.reports.fit_page import fit_html
+from remaster_ros.reports.result_lines import fit_lines
+from remaster_ros.reports.sentences import METRICS, as_drawn, load_words, loadable_of_fit
 
 
 def with_accuracy(result, split, before, after):

@@ -15,7 +15,7 @@ from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.errors import InputError
 from remaster_ros.reports.fit_json import fit_content
 from remaster_ros.reports.result_folder import save_fit
-from remaster_ros.reports.sentences import fit_lines
+from remaster_ros.reports.result_lines import fit_lines
 from remaster_ros.session.records.reader import read_session, write_session
 
 PAGE = Path(__file__).parents[3] / 'docs/session-format.md'

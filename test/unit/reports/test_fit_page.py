@@ -15,9 +15,9 @@ from rigs.browser import seen
 
 from remaster_ros.kinematics import transforms
 from remaster_ros.kinematics.transforms import apply
-from remaster_ros.reports.report import _round_factor, draw_view, fit_html
+from remaster_ros.reports.fit_judgement import verdict
+from remaster_ros.reports.fit_page import _round_factor, draw_view, fit_html
 from remaster_ros.reports.result_folder import save_fit
-from remaster_ros.reports.sentences import verdict
 
 
 @pytest.fixture(scope='module')
