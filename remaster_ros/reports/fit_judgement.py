@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from remaster_ros.calibration.measured_again import MeasuredAgain
 from remaster_ros.calibration.noise_check import NoiseCheck
 from remaster_ros.calibration.residual_structure import FEWEST_POSES
 from remaster_ros.reports.rows_csv import lengths_mm
-from remaster_ros.reports.schemas import Judgement
+from remaster_ros.reports.schemas import Judgement, Mood
 from remaster_ros.reports.sentences import (
     NOT_PROVEN,
     NOTICEABLE_GAIN,
@@ -31,15 +31,70 @@ FEW_POSES = 'So few poses do not show'
 SEARCH = 'run "remaster discover"'
 
 
+class _Comparison(NamedTuple):
+    """Mean errors before and after the fit, which its judgement compares."""
+
+    validated: bool  # Whether they are of held-out poses
+    again: MeasuredAgain  # Held-out configurations that were fitted as well
+    before_mm: float
+    after_mm: float
+    where: str  # Poses of these errors as text
+
+    @property
+    def gain(self) -> float:
+        """Error before over error after."""
+        return self.before_mm / max(self.after_mm, 1e-9)
+
+    @property
+    def change(self) -> str:
+        """Text such as '0.912 mm to 0.101 mm on poses it never fitted'."""
+        return f'{self.before_mm:.3f} mm to {self.after_mm:.3f} mm {self.where}'
+
+
+class _Residuals(NamedTuple):
+    """Result of the comparison of the residuals with noise, a sentence for each point."""
+
+    unexplained: list[NoiseCheck]  # Checks of the sensors whose error noise does not explain
+    findings: list[str]  # These errors, and the drivers that the residuals follow
+    doubts: list[str]  # Errors whose noise is unknown, and too few poses
+    doubtful: bool  # Whether other errors than noise are left, or may be
+    too_few_poses: bool  # Whether the poses are too few to show such errors
+
+
 def verdict(result: FitResult) -> Judgement:
     """Judgement of a fit: gain, convergence, and offsets that are not identifiable.
 
     'bad' if chains disagree, the error grows by over a tenth or offsets are implausible; 'good' if
     held-out poses show a gain of a tenth, noise explains the rest and nothing disagrees.
     """
+    compared = _comparison(result)
+    residuals = _residuals(result)
+    disagreements = _disagreements(result)
+    not_proven = _not_proven(result, compared)
+    proven = not (disagreements or residuals.too_few_poses or compared.again.most or not_proven)
+    mood, headline = _mood_and_headline(result, compared, residuals, proven)
+    if result.implausible:
+        mood = 'bad'
+        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
+    points = [
+        *result.implausible,
+        *residuals.findings,
+        *residuals.doubts,
+        *_widening(result),
+        *disagreements,
+        *_measurement_remarks(result, compared.again),
+        *not_proven,
+        _sampling(result.sampler),
+        *_determined_offsets(result),
+        *_left_out(result),
+    ]
+    return Judgement(mood, headline, points, residuals.findings, residuals.doubts, disagreements)
+
+
+def _comparison(result: FitResult) -> _Comparison:
+    """Errors before and after, on held-out poses if there are any, else on fitted ones."""
     validated = result.accuracy['validation'] is not None
     before, after = _mean_errors_mm(result, validated)
-    gain = before / max(after, 1e-9)
     again = MeasuredAgain.of(result.session.measurements)
     where = 'on poses it never fitted' if validated else 'on the fitted poses'
     if again.most:
@@ -47,74 +102,100 @@ def verdict(result: FitResult) -> Judgement:
     gross = sum(len(check.gross) for check in result.noise_checks) if validated else 0
     if gross:
         where += f' ({not_counted(gross)})'
-    change = f'{before:.3f} mm to {after:.3f} mm {where}'
+    return _Comparison(validated, again, before, after, where)
+
+
+def _residuals(result: FitResult) -> _Residuals:
+    """Comparison of the residuals with the noise of each sensor, and their structure."""
     unexplained = [check for check in result.noise_checks if check.explained is False]
-    untold = [check for check in result.noise_checks if check.explained is None]
-    changes = references(result)[1]
-    spoilt = [check.spoilt for check in result.noise_checks if check.spoilt]
-    displaced = [f'{line}.' for line in result.displaced_markers]
-    findings = [_compared(check) for check in unexplained] + _structure(result)
-    doubts = [_compared(check) for check in untold]
-    few = result.structure is not None and result.structure.too_few
-    if few:
+    unknown = [check for check in result.noise_checks if check.explained is None]
+    doubts = [_compared(check) for check in unknown]
+    too_few_poses = result.structure is not None and result.structure.too_few
+    if too_few_poses:
         doubts.append(
             f'{FEW_POSES} whether other errors than noise are left, which the offsets would '
             f'take up: measure at least {FEWEST_POSES} and fit again.'
         )
-    disagreements = [*result.session.disagreements, *changes, *spoilt, *displaced]
+    return _Residuals(
+        unexplained,
+        findings=[_compared(check) for check in unexplained] + _structure(result),
+        doubts=doubts,
+        doubtful=bool(unexplained or unknown) or result.other_errors,
+        too_few_poses=too_few_poses,
+    )
+
+
+def _disagreements(result: FitResult) -> list[str]:
+    """Sentences on data that contradict each other; [] if there are none.
+
+    Of the session, of its references, of gross errors, markers, and standstill against motion.
+    """
     proof = result.motion_proof
-    if proof is not None and proof.disagree:
-        disagreements.append(proof.words)
-    points = findings + doubts + _widening(result) + disagreements
-    doubtful = bool(unexplained or untold) or result.other_errors
+    return [
+        *result.session.disagreements,
+        *references(result)[1],
+        *(check.spoilt for check in result.noise_checks if check.spoilt),
+        *(f'{line}.' for line in result.displaced_markers),
+        *([proof.words] if proof is not None and proof.disagree else []),
+    ]
+
+
+def _not_proven(result: FitResult, compared: _Comparison) -> list[str]:
+    """Sentence that no or too few poses were held out; [] if enough were."""
+    if not compared.validated:
+        return [NOT_PROVEN]
     hardly = hardly_proven(held_out_poses(result.session))
-    unproven = disagreements or few or again.most or not validated or hardly
-    mood: Literal['good', 'caution', 'bad'] = 'caution'
-    if result.sampler.wandering and not result.sampler.converged:
-        mood = 'bad'
-        headline = (
+    return [hardly] if hardly else []
+
+
+def _mood_and_headline(
+    result: FitResult, compared: _Comparison, residuals: _Residuals, proven: bool
+) -> tuple[Mood, str]:
+    """Mood and headline by convergence and gain, before implausible offsets are considered.
+
+    ``proven``: whether enough held-out poses show the gain, and no data disagree.
+    """
+    sampler, change = result.sampler, compared.change
+    rest = f' {_dominated(result, residuals.unexplained)}' if residuals.doubtful else ''
+    if sampler.wandering and not sampler.converged:
+        return 'bad', (
             'The chains have not converged, so nothing is decided yet: '
             f'for now the mean position error goes from {change}.'
         )
-    elif not result.sampler.converged and result.sampler.method != 'metropolis':
-        headline = (
+    if not sampler.converged and sampler.method != 'metropolis':
+        return 'caution', (
             'The data leave some parameters so open that their distribution is known only '
-            f'approximately. The mean position error goes from {change}.'
+            f'approximately. The mean position error goes from {change}.{rest}'
         )
-        if doubtful:
-            headline += f' {_dominated(result, unexplained)}'
-    elif gain >= NOTICEABLE_GAIN:
-        headline = f'The mean position error falls from {change}: {times_smaller(before, after)}.'
-        if doubtful:
-            headline += f' {_dominated(result, unexplained)}'
-        elif result.sampler.converged and not unproven:
-            mood = 'good'
-    elif gain > 1 / NOTICEABLE_GAIN:
-        headline = (
-            f'The zero-offsets hardly matter here: the mean position error goes from {change}.'
+    if compared.gain >= NOTICEABLE_GAIN:
+        good = proven and sampler.converged and not residuals.doubtful
+        smaller = times_smaller(compared.before_mm, compared.after_mm)
+        return ('good' if good else 'caution'), (
+            f'The mean position error falls from {change}: {smaller}.{rest}'
         )
-        if doubtful:
-            headline += f' {_dominated(result, unexplained)}'
-        elif not few:
-            headline += ' That is what noise explains.'
-    else:
-        mood = 'bad'
-        headline = f'The offsets make it worse: the mean position error goes from {change}.'
-    if result.implausible:
-        mood = 'bad'
-        headline += ' Do not apply the offsets yet: they are larger than a mastering is off by.'
-        points = [*result.implausible, *points]
-    if proof is not None and not proof.disagree:
-        points.append(proof.words)
-    if again.again:
-        points.append(again.words)
-    if note := result.session.correction_note:
-        points.append(note)
-    if not validated:
-        points.append(NOT_PROVEN)
-    elif hardly:
-        points.append(hardly)
-    points.append(_sampling(result.sampler))
+    if compared.gain > 1 / NOTICEABLE_GAIN:
+        if not residuals.doubtful and not residuals.too_few_poses:
+            rest = ' That is what noise explains.'
+        return 'caution', (
+            'The zero-offsets hardly matter here: the mean position error goes from '
+            f'{change}.{rest}'
+        )
+    return 'bad', f'The offsets make it worse: the mean position error goes from {change}.'
+
+
+def _measurement_remarks(result: FitResult, again: MeasuredAgain) -> list[str]:
+    """Remarks on motion, on held-out configurations fitted as well, and on a correction."""
+    proof = result.motion_proof
+    remarks = [
+        proof.words if proof is not None and not proof.disagree else '',
+        again.words if again.again else '',
+        result.session.correction_note,
+    ]
+    return [remark for remark in remarks if remark]
+
+
+def _determined_offsets(result: FitResult) -> list[str]:
+    """Sentences on the number of identifiable offsets, and on what orientations add."""
     unknown = [
         joint
         for joint, known in zip(result.joint_names, result.identifiable, strict=True)
@@ -122,23 +203,28 @@ def verdict(result: FitResult) -> Judgement:
     ]
     count = len(result.joint_names)
     if unknown:
-        points.append(
+        lines = [
             f'{count - len(unknown)} of {count} zero-offsets '
             f'{"is" if count - len(unknown) == 1 else "are"} measured; that of {listed(unknown)} '
             'cannot be told from other errors, which the table of zero-offsets names.'
-        )
+        ]
     else:
-        points.append(f'All {count} zero-offsets are measured.')
+        lines = [f'All {count} zero-offsets are measured.']
     if result.orientations_in_words:
         words = result.orientations_in_words
-        points.append(f'{words[0].upper()}{words[1:]}.')
-    if result.left_out:
-        left_out = len(result.left_out)
-        points.append(
-            f'{counted(left_out, "observation")} {"is" if left_out == 1 else "are"} left out as '
-            'gross errors; they are listed below.'
-        )
-    return Judgement(mood, headline, points, findings, doubts, disagreements)
+        lines.append(f'{words[0].upper()}{words[1:]}.')
+    return lines
+
+
+def _left_out(result: FitResult) -> list[str]:
+    """Sentence on the number of observations left out as gross errors; [] if there are none."""
+    left_out = len(result.left_out)
+    if not left_out:
+        return []
+    return [
+        f'{counted(left_out, "observation")} {"is" if left_out == 1 else "are"} left out as '
+        'gross errors; they are listed below.'
+    ]
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
