@@ -18,7 +18,8 @@ from remaster_ros.cli.options import names, number
 from remaster_ros.compensation.compensator import ROUNDING_RAD, Compensator, Correction
 from remaster_ros.compensation.file import read_compensation
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import ColumnChoice, Columns, find_columns
+from remaster_ros.importing.column_search import find_columns
+from remaster_ros.importing.columns import ColumnChoice, Columns
 from remaster_ros.importing.text_table import TextTable, read_table
 from remaster_ros.importing.units import ANGLES
 from remaster_ros.importing.values import joint_values, numbers, times

@@ -29,7 +29,8 @@ from remaster_ros.importing.assemble import (
 from remaster_ros.importing.bags import is_bag, read_bag, read_streams
 from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.moving import MovingOptions, moving_session, with_proof
-from remaster_ros.importing.rows import RawRows, TableOptions, from_tool, read_rows
+from remaster_ros.importing.raw_rows import RawRows, from_tool
+from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.sense import Sense, check_sense
 from remaster_ros.importing.sessions import Stretch, arrangement_of, corrected_session
 from remaster_ros.importing.turns import with_orientation

@@ -16,7 +16,7 @@ from remaster_ros.calibration.arrangement import FEWEST_ROWS, linear_fit
 from remaster_ros.calibration.gauge_words import counted
 from remaster_ros.calibration.mistakes import UNKNOWN_MARKER_STD_M
 from remaster_ros.errors import InputError
-from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.raw_rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.pad_angles import PadAngles, coupled_in_circle
 from remaster_ros.kinematics.serial_chain import SerialChain

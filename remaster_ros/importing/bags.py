@@ -15,13 +15,13 @@ import numpy as np
 from remaster_ros.errors import InputError
 from remaster_ros.importing.calibration_data import CALIBRATION_DATA, rows_of
 from remaster_ros.importing.moving import MarkerStream
-from remaster_ros.importing.rows import STATIC, RawRows
+from remaster_ros.importing.raw_rows import STATIC, RawRows
+from remaster_ros.importing.standstill_matching import match
 from remaster_ros.importing.standstills import (
     SWING_S,
     Stream,
     between,
     joint_standstills,
-    match,
     point_visits,
     reading_of,
     refuse_sliding,

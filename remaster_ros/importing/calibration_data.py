@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.rows import RawRows, moving_markers
+from remaster_ros.importing.raw_rows import RawRows, moving_markers
 from remaster_ros.importing.units import LENGTHS
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FARTHEST_M, FloatArray

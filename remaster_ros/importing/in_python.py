@@ -23,7 +23,8 @@ from remaster_ros.importing.assemble import (
 )
 from remaster_ros.importing.frames import is_frame, tables_of
 from remaster_ros.importing.makers.named import first_names
-from remaster_ros.importing.rows import RawRows, TableOptions, read_rows
+from remaster_ros.importing.raw_rows import RawRows
+from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.sense import check_sense
 from remaster_ros.importing.text_table import TextTable
 from remaster_ros.importing.turns import with_orientation

@@ -30,7 +30,7 @@ from remaster_ros.calibration.mistakes import (
 from remaster_ros.calibration.priors import DISPLACED, LARGEST_OFFSET, UNCALIBRATED_ERROR_M
 from remaster_ros.calibration.rows_off import RowsOff, find_rows_off
 from remaster_ros.errors import InsufficientDataError
-from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.raw_rows import RawRows
 from remaster_ros.importing.units import split_unit
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.types import FloatArray, Session
@@ -48,6 +48,8 @@ _LARGEST_UNMASTERED = np.pi / 4.0
 NEVER_MASTERED = '--never-mastered'
 # Number of rows that a sentence names.
 SHOWN_ROWS = 5
+# End of the finding on measured orientations that fit nothing.
+ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
 
 
 @dataclass(frozen=True)
@@ -295,9 +297,6 @@ def _too_many_outliers(
         error_m=given.error_m,
         rows_off=outlying,
     )
-
-
-ON_TOOL = '; poses that a camera on the tool has of a board that stands need --on-tool'
 
 
 def _unmastered(given: Fitted, error_text: str, chain: SerialChain, never_mastered: bool) -> Sense:

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from remaster_ros.calibration.arrangement import linear_fit
 from remaster_ros.importing.assemble import SessionOptions, controller_of
-from remaster_ros.importing.rows import RawRows
+from remaster_ros.importing.raw_rows import RawRows
 from remaster_ros.kinematics.pad_angles import PadAngles
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.kinematics.transforms import inverse_poses
@@ -39,6 +39,7 @@ FEWEST_ROWS = 8
 # At half a turn a rotation vector may as well be its opposite, rad.
 _HALF_TURN_RAD = 2.9
 _REFERENCES = 5
+_OF_THE_ROBOT = 'are how the robot itself believes its tool to be turned, not measured'
 
 
 def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions) -> RawRows:
@@ -110,9 +111,6 @@ def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions)
             f'{np.degrees(error):.2f} degrees',
         ),
     )
-
-
-_OF_THE_ROBOT = 'are how the robot itself believes its tool to be turned, not measured'
 
 
 def _without_orientation(rows: RawRows, why: str) -> RawRows:

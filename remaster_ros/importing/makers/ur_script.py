@@ -19,6 +19,9 @@ _DEGREES = re.compile(rf'd2r\(\s*({NUMBER.pattern})\s*\)')
 # Six numbers in a list, and calls other than movej that take such lists.
 _SIX = re.compile(r'(?<!p)\[\s*(?:[-+.\deE]+\s*,\s*){5}')
 _OTHERS = re.compile(r'\b(?:speed[jl]|set_\w+|force_mode|inverse_\w+|textmsg|get_\w+)\s*\(')
+# Elements of a .urp file: a waypoint with its name, and its joint angles.
+_WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>]*)(?:>|$)')
+_ANGLES = re.compile(r'\s*angles="([^"<>]*)"\s*/?\s*')
 _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
 
@@ -101,10 +104,6 @@ def _whole_lists(text: str) -> list[tuple[int, str]]:
             lines.append((number, [code]))
         opened = max(opened, 0) + code.count('[') - code.count(']')
     return [(number, ' '.join(parts)) for number, parts in lines]
-
-
-_WAYPOINT = re.compile(r'<Waypoint\b[^<>]*\bname="([^"<>]*)"|<JointAngles\b([^<>]*)(?:>|$)')
-_ANGLES = re.compile(r'\s*angles="([^"<>]*)"\s*/?\s*')
 
 
 def _waypoints(text: str) -> NamedColumns:

@@ -11,7 +11,7 @@ from foreign.tables import measured, text, write
 from foreign.workbooks import Day, workbook
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import find_columns
+from remaster_ros.importing.column_search import find_columns
 from remaster_ros.importing.makers.named import NUMBER
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table

@@ -12,7 +12,8 @@ from foreign.tables import measured, text, write
 from rigs.command_line import remaster
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import ColumnChoice, find_columns
+from remaster_ros.importing.column_search import find_columns
+from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.makers import READERS
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import read_table

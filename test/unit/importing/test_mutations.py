@@ -14,7 +14,7 @@ from foreign.tables import text
 from test_makers import JOINTS, changed_cell, joints_of, mutated
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import find_columns
+from remaster_ros.importing.column_search import find_columns
 from remaster_ros.importing.text_table import read_table
 from remaster_ros.importing.values import length_unit, numbers, times
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.columns import ColumnChoice, find_columns
+from remaster_ros.importing.column_search import find_columns
+from remaster_ros.importing.columns import ColumnChoice
 from remaster_ros.importing.rows import TableOptions, read_rows
 from remaster_ros.importing.text_table import decode, parse_number, read_table
 from remaster_ros.importing.values import numbers, times
