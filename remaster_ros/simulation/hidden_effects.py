@@ -44,7 +44,6 @@ NAMED: dict[str, HiddenKind] = {}
 UNNAMED: dict[str, HiddenKind] = {}
 # Effects that only an arm with a joint that slides can have.
 OF_SLIDES: dict[str, HiddenKind] = {}
-KINDS = NAMED | UNNAMED | OF_SLIDES
 
 
 def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
@@ -585,6 +584,9 @@ def pitching_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     d.tilt[:, j - 1] += turn
     # That turns the way about its zero; the carriage stays where it is.
     d.shift[:, j] -= np.cross(turn, c.q[:, [j - 1]] * c.axes[j - 1])
+
+
+KINDS = NAMED | UNNAMED | OF_SLIDES
 
 
 def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:

@@ -173,7 +173,7 @@ def test_an_error_that_is_none_of_the_session_is_tried_again(sessions, by_one):
 
 STARTS = """
 import sys, time
-from remaster_ros.cli import batch
+from remaster_ros.cli import batch, batch_workers
 if __name__ == '__main__':
     pool = batch_workers.local_pool(1)
     print(pool.submit(batch.os.getpid).result(), flush=True)
@@ -302,7 +302,7 @@ def test_a_scheduler_that_ends_is_one_line():
 
 
 def test_workers_of_another_version_are_refused(scheduler, monkeypatch):
-    monkeypatch.setattr(batch, '_version', other_version)
+    monkeypatch.setattr(batch_workers, '_version', other_version)
     with (
         pytest.raises(batch.InputError, match=r'has remaster_ros 0\.0\.1'),
         batch_workers.scheduled(scheduler.scheduler_address, insecure=False),

@@ -33,7 +33,14 @@ from remaster_ros.collection.events import (
 )
 from remaster_ros.collection.message_fields import seconds
 from remaster_ros.motion.states import Arm
-from remaster_ros.nodes import rivals, robot_bridge, simulated_clock, status
+from remaster_ros.nodes import (
+    arm_states,
+    emergency_link,
+    rivals,
+    robot_bridge,
+    simulated_clock,
+    status,
+)
 from remaster_ros.nodes.messages import waypoints_message
 from remaster_ros.planning.tour_order import PoseVisit
 from remaster_ros.session.bridge_files import LastCommandFile
@@ -156,7 +163,7 @@ class Rig:
     ):
         self.wall = 1000.0
         clock = SimpleNamespace(monotonic=lambda: self.wall, time_ns=time.time_ns)
-        for module in (simulated_clock, status, rivals):
+        for module in (simulated_clock, status, rivals, arm_states, emergency_link):
             monkeypatch.setattr(module, 'time', clock)
         # The age of the last command follows the test's clock as well.
         dated = SimpleNamespace(monotonic=clock.monotonic, time_ns=self.time_ns)

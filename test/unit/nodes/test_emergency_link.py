@@ -10,7 +10,7 @@ pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
-from remaster_ros.nodes import robot_bridge
+from remaster_ros.nodes import emergency_link
 from remaster_ros.nodes.emergency_link import EmergencyLink
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(60)]
@@ -29,7 +29,7 @@ class Bench:
 
     def __init__(self, monkeypatch, own_nodes):
         self.now, self.states = 500.0, []
-        monkeypatch.setattr(robot_bridge, 'time', SimpleNamespace(monotonic=lambda: self.now))
+        monkeypatch.setattr(emergency_link, 'time', SimpleNamespace(monotonic=lambda: self.now))
         self.node = own_nodes.make('listener')
         self.robot = own_nodes.make('robot', is_spun=False, beside=self.node)
         self.spin = own_nodes.until

@@ -13,7 +13,7 @@ import pytest
 from worlds.optitrack_world import SENSOR, MarkerWorld
 
 from remaster_ros.simulation import world_clock
-from remaster_ros.simulation import world_clock as pace_module
+from remaster_ros.simulation import world_pace as pace_module
 from remaster_ros.simulation.optitrack import FakeOptiTrackServer
 from remaster_ros.simulation.world_clock import HELD_WALL_S, WorldClock
 from remaster_ros.simulation.world_pace import (
