@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import pytest
 
-from remaster_ros.nodes import opening_file
 from remaster_ros.nodes.opening_file import opening_file, opening_path, page_name
 
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(opening_file, 'runtime_folder', lambda: tmp_path)
+    monkeypatch.setattr('remaster_ros.nodes.opening_file.runtime_folder', lambda: tmp_path)
     return tmp_path
 
 
