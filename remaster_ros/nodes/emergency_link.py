@@ -7,14 +7,10 @@ import time
 from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
-
-if TYPE_CHECKING:
-    pass
 
 
 PERIODIC = 6

@@ -68,12 +68,12 @@ STEP_S = 0.02
 class LogBook:
     """A node's logger that keeps what is written, and else is the node's own."""
 
-    def __init__(self, name, lines):
-        self._own, self._lines = name, lines
+    def __init__(self, logger, lines):
+        self._logger, self._lines = logger, lines
 
     def __getattr__(self, name):
         if name not in ('info', 'warning', 'error'):
-            return getattr(self._own, name)
+            return getattr(self._logger, name)
         return lambda text: self._lines.append((name, text))
 
 

@@ -138,7 +138,7 @@ def bent(seed=5):
 
 
 def off_curve(r, points, shares, since=0):
-    """Return how far the arm was from the curve at most, rad, since a row of its history."""
+    """Largest distance of the arm from the curve, rad, from a row of its history on."""
     curve = Spline.through(points, shares)
     been = np.array([q for _, q, _ in r.arm.history])[since:]
     return np.max(np.abs(been - curve.at(curve.nearest(been, TURNING))))
