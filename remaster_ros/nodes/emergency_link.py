@@ -12,7 +12,6 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
-
 PERIODIC = 6
 """By so many messages it is judged whether they come regularly."""
 
