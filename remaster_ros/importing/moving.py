@@ -75,7 +75,8 @@ LONGEST_COUNTED = 100
 # 0.4 s at 120 Hz, does not change it.
 DELAY_FRAMES = 101
 # The number of a frame is sure if the rise of the delay is within this share of a period of a
-# whole number: of frames at no constant rate that is one half, and frames at one have this share.
+# whole number: of frames at no constant rate that is one half. Frames come at one if this share is
+# sure, and comes in time.
 SURE_PERIODS, AT_A_RATE = 0.25, 0.9
 # Longest step, s: beyond it the tangent is not valid.
 LONGEST_CLOCK_STEP_S = 0.05
@@ -149,7 +150,8 @@ class _Frames:
 
         A frame's number counts the frames before it and those lost: by so much their delay has
         risen for good. Frames, or all of a while, may be late. They come at a constant rate if
-        nine tenths of the numbers are sure; the other frames are left out.
+        nine tenths of the numbers are sure, and as many of these frames are within half a period
+        of it; the frames without a sure number are left out.
         """
         stamps = self.stamps
         gaps = np.diff(stamps)
@@ -178,11 +180,13 @@ class _Frames:
         kept = np.abs(rising - lost) < SURE_PERIODS
         if np.mean(kept) < AT_A_RATE:
             return None
-        ticks = (index + lost)[kept]
-        steady = np.polynomial.Polynomial.fit(ticks, stamps[kept], 1)(ticks)
-        scatter_s = float(np.std(stamps[kept] - steady))
-        if scatter_s > 0.5 * period:
+        ticks, stamps = (index + lost)[kept], stamps[kept]
+        late = stamps - np.polynomial.Polynomial.fit(ticks, stamps, 1)(ticks)
+        usual = np.abs(late - np.median(late)) < 0.5 * period
+        if np.mean(usual) < AT_A_RATE:
             return None
+        steady = np.polynomial.Polynomial.fit(ticks[usual], stamps[usual], 1)(ticks)
+        scatter_s = float(np.std((stamps - steady)[usual]))
         return _Frames(steady, self.positions[kept], self.markers, scatter_s)
 
 

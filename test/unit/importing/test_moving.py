@@ -166,6 +166,9 @@ def test_frames_that_are_late_for_a_while_are_not_lost_ones():
     late = regular + rng.normal(0.0, 5e-4, len(number))
     for begin, end in ((1000, 1120), (4000, 4200)):
         late[begin:end] += 4.5e-3
+    # And a host that is held up again and again: its frames come together.
+    for begin in range(300, 5900, 700):
+        late[begin : begin + 25] = late[begin + 25] - 1e-6 * np.arange(25, 0, -1)
     positions = np.zeros((len(late), 1, 3))
     steady = _Frames(np.sort(late), positions, np.zeros(1, int)).at_constant_rate()
     assert len(steady.stamps) > 0.99 * len(regular)
