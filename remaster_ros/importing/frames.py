@@ -27,10 +27,10 @@ def is_frame(given: Any) -> bool:
 
 
 def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
-    """Data frames as text tables; `names` are for messages.
+    """Data frames as text tables, one each; `names` are theirs in messages.
 
-    The index becomes a column, ``time`` or ``index``, unless it counts the rows of all frames from
-    0 on. Raises InputError if an index is twice in frames to be joined.
+    The index becomes a column, ``time`` or ``index``, unless that of each frame counts its rows from 0
+    on. Raises InputError if there are several frames and one has the same index label twice.
     """
     plain = all(_counts(frame) for frame in frames)
     for frame, name in zip(frames, names):
@@ -47,28 +47,27 @@ def _counts(frame: Any) -> bool:
 
 
 def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
-    """Text table of a data frame, with its index as a column if `with_index`.
+    """Text table of a data frame; its index is the first column if `with_index`.
 
-    Levels of column names are joined by a blank. Columns that are merely counted have no header.
+    Levels of column names are joined by a blank. A table whose columns are merely counted, as
+    those of an array, has no header; among named columns a counted one is called 'column 3'.
     Rows without a value are left out, with a note.
     """
     header = [' '.join(map(str, c)) if isinstance(c, tuple) else str(c) for c in frame.columns]
-    # A frame of an array has counted columns: no names.
-    named = header != [*map(str, range(len(header)))]
+    named = not all(map(str.isdigit, header))
+    # A header with numbers would be read as a row of data.
+    header = [f'column {text}' if text.isdigit() else text for text in header]
     rows = [[_cell(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    empty = [str(i) for i, row in enumerate(rows) if not any(row)]
     if with_index:
-        labels = [_cell(label) for label in frame.index]
         timed = all(hasattr(label, 'isoformat') for label in frame.index)
         header = ['time' if timed and 'time' not in header else _INDEX, *header]
-        if not named:
-            header = [header[0], *(str(i) for i in range(1, len(header)))]
-            named = True
-        rows = [[label, *row] for label, row in zip(labels, rows)]
+        # A row of empty cells is left out by the reader, so that the others keep their numbers.
+        rows = [[_cell(label) if any(row) else '', *row] for label, row in zip(frame.index, rows)]
     text = io.StringIO()
     writer = csv.writer(text, delimiter='\t', lineterminator='\n')
     writer.writerows([header] * named + rows)
     table = table_of_text(text.getvalue(), Path(name))
-    empty = [str(i) for i, row in enumerate(rows) if not any(row)]
     note = f'{name}, row{"s" * (len(empty) > 1)} {first_names(empty)}: no value, left out'
     return replace(
         table,

@@ -33,6 +33,10 @@ def columns_of(arm):
     return joints, points
 
 
+def array_frame(array, frame):
+    return frame(dict(enumerate(array.T)))
+
+
 def test_a_frame_is_the_table_in_a_file(arm, frame, tmp_path):
     joints, points = columns_of(arm)
     urdf = tmp_path / 'robot.urdf'
@@ -45,6 +49,46 @@ def test_a_frame_is_the_table_in_a_file(arm, frame, tmp_path):
     two = remaster_ros.session_from(frame(joints), frame(points), urdf).measurements
     np.testing.assert_array_equal(two.q, of_file.q)
     np.testing.assert_array_equal(two.position, of_file.position)
+
+
+@pytest.mark.parametrize('columns', ['counted', 'counted on'])
+@pytest.mark.parametrize('index', ['from 5', 'permuted', 'names'])
+def test_frames_of_arrays_have_no_row_more_than_the_arrays(columns, index, arm, frame, tmp_path):
+    """Column labels that are numbers are no row of data, whatever the index is."""
+    urdf, n = tmp_path / 'robot.urdf', len(arm.q)
+    rows = np.arange(5, n) if index == 'from 5' else np.random.default_rng(2).permutation(n)
+    labels = [f'P{i:02d}' for i in rows] if index == 'names' else [int(i) for i in rows]
+    first = 0 if columns == 'counted' else 3
+    q, points = np.rad2deg(arm.q).round(4)[rows], (1e3 * arm.points).round(3)[rows]
+    frames = [frame(dict(enumerate(array.T, start=first)), index=labels) for array in (q, points)]
+    found = remaster_ros.session_from(*frames, urdf).measurements
+    arrays = [array_frame(array, frame) for array in (q, points)]
+    of_arrays = remaster_ros.session_from(*arrays, urdf)
+    np.testing.assert_array_equal(found.q, of_arrays.measurements.q)
+    np.testing.assert_array_equal(found.position, of_arrays.measurements.position)
+
+
+def test_a_frame_of_an_array_with_its_index_as_a_column(arm, frame, tmp_path):
+    """As `reset_index` of pandas leaves it: a name among numbers."""
+    urdf, values = tmp_path / 'robot.urdf', np.hstack([np.rad2deg(arm.q), 1e3 * arm.points])
+    given = frame({'index': [*range(3, 3 + len(values))], **dict(enumerate(values.T))})
+    with pytest.raises(InputError, match=r'the columns are index, column 0, column 1'):
+        remaster_ros.import_table(given, urdf=urdf)
+    names = [f'column {i}' for i in range(9)]
+    found = remaster_ros.import_table(given, urdf=urdf, joints=names[:6], points=names[6:])
+    np.testing.assert_allclose(found.measurements.q, arm.q, atol=1e-9)
+
+
+def test_a_row_without_values_is_left_out_with_its_label(arm, frame, tmp_path, caplog):
+    urdf, kept = tmp_path / 'robot.urdf', np.delete(np.arange(5, len(arm.q)), 3)
+    q, points = np.rad2deg(arm.q).round(4)[5:], (1e3 * arm.points).round(3)[5:]
+    q[3] = np.nan
+    labels = range(5, len(arm.q))
+    frames = [frame(dict(enumerate(array.T)), index=[*labels]) for array in (q, points)]
+    found = remaster_ros.session_from(*frames, urdf).measurements
+    np.testing.assert_allclose(found.q, arm.q[kept], atol=1e-6)
+    assert 'joints, row 3: no value, left out' in caplog.text
+    assert 'points: 8: not in the other table, left out' in caplog.text
 
 
 @pytest.mark.parametrize('labels', ['names', 'numbers'])
