@@ -84,7 +84,11 @@ def random_configurations(
     followed = [seen.marker[np.flatnonzero(seen.sensor == s)[0]] for s in np.unique(seen.sensor)]
     sensor = np.arange(count) % len(followed)
     rows = np.arange(count)
-    chain = model.chain
+    # Over one turn of a continuous joint, whose limits are infinite.
+    low, high = (
+        np.where(np.isfinite(limit), limit, turn)
+        for limit, turn in ((model.chain.lower, -np.pi), (model.chain.upper, np.pi))
+    )
     return replace(
         seen.select(np.zeros(count, dtype=np.int64)),
         observation=rows,
@@ -92,7 +96,7 @@ def random_configurations(
         configuration=rows,
         sensor=np.unique(seen.sensor)[sensor],
         marker=np.array(followed)[sensor],
-        q=rng.uniform(chain.lower, chain.upper, (count, len(chain))),
+        q=rng.uniform(low, high, (count, len(low))),
         # Of the marker's own place: a sensor on the tool has measured nothing from there.
         orientation=None,
     )

@@ -121,7 +121,10 @@ class MissedSolutions:
 
 @dataclass(frozen=True)
 class _ExactArm:
-    """Nearest arm with a closed form, for one combination of values of the held joints."""
+    """Arm with closed-form inverse kinematics that is nearest to the true one.
+
+    One for each combination of values of the held joints.
+    """
 
     chain: SerialChain  # Its six free joints
     robot: HPRobot  # EAIK's model of the chain, whose tool is not rotated at zero angles
@@ -138,8 +141,9 @@ class _ExactArm:
     def perturbations(self) -> tuple[FloatArray, FloatArray]:
         """Perturbations of a pose, the first zero: rotations (n, 3, 3), translations, m, (n, 3).
 
-        Six orthogonal directions and their opposites, so that one of them leads to a pose at which
-        the exact arm has the solutions that the true arm has at the pose itself.
+        Only the zero one for a true arm with a closed form. Else also six orthogonal directions
+        and their opposites, so that one of them leads to a pose at which the exact arm has the
+        solutions that the true arm has at the pose itself.
         """
         if self.is_true_arm:
             return np.eye(3)[None], np.zeros((1, 3))
@@ -217,7 +221,10 @@ class InverseKinematics:
 
     @property
     def method(self) -> Literal['closed form', 'near closed form', 'many starts']:
-        """Method by which solutions are found; the hardest one if held values differ in it."""
+        """Method by which solutions are found.
+
+        The least direct one if it differs between the values at which joints are held.
+        """
         exact = [part for _, part in self._parts]
         if None in exact:
             return 'many starts'
@@ -322,10 +329,11 @@ class InverseKinematics:
     def _starts(
         self, values: tuple[float, ...], exact: _ExactArm | None, T: FloatArray
     ) -> FloatArray:
-        """Return starts of Newton's method for a pose and one set of held values, (m, k).
+        """Return start configurations of Newton's method for a tool pose T (4, 4), (m, k).
 
-        The solutions of the nearest arm with a closed form, ``exact``, or `STARTS` positions
-        spread evenly over the free joints.
+        Solutions of ``exact``, the nearest arm with a closed form; m is 0 if it has none. If
+        ``exact`` is None, `STARTS` positions spread evenly over the free joints. ``values``: of
+        the held joints, in order.
         """
         free = spread(self.chain, self._free, STARTS) if exact is None else exact.starts(T)
         return self._with_held(free, values)
@@ -415,7 +423,7 @@ class InverseKinematics:
         """
         bounded = np.isfinite(self.chain.lower) & np.isfinite(self.chain.upper)
         middle = np.zeros(len(self.chain))
-        middle[bounded] = (self.chain.lower + self.chain.upper)[bounded] / 2
+        middle[bounded] = (self.chain.lower[bounded] + self.chain.upper[bounded]) / 2
         turns = np.where(self.chain.slides, 0.0, np.round((middle - q) / (2 * np.pi)))
         return q + 2 * np.pi * turns
 
