@@ -46,7 +46,7 @@ def read_session(folder: str | os.PathLike[str]) -> Session:
     Raises
     ------
     InputError
-        What is wrong, with file, row and column.
+        What is wrong, with file, row and column; also if there is no such folder.
 
     Examples
     --------
@@ -77,9 +77,9 @@ def session_from(
     sensor_kind: Literal['', 'camera', 'tracker', 'controller'] = '',
     seed: int = 0,
 ) -> Session:
-    """Make a session of arrays, or of two data frames.
+    """Make a session of joint angles and marker positions in arrays, or in two data frames.
 
-    A row with NaN is left out, with a warning.
+    A row with NaN is left out, with a warning. Nothing is written to the disk.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def session_from(
     points
         Measured marker positions in the sensor's own frame, (n, 3); or a dict of x, y and z; or a
         data frame. Rows of two frames are joined by their index; by their names, times or order
-        where both count the rows.
+        if both merely count the rows.
     urdf
         File of the nominal arm.
     base_link, tip_link
@@ -97,20 +97,21 @@ def session_from(
     angles, length
         Units; '' for rad and m of arrays, and for those found in data frames.
     couple, reverse, offset_deg
-        As of `import_table`.
+        Corrections of the joints: joint -> another one that is added (``'-J2'``: subtracted),
+        those that count the other way round, and joint -> angle that is added, degrees.
     never_mastered
         Zero-offsets may be of any size (hobby servos, a motor that was replaced).
     sensor_kind
-        What measured the points; '' where it is unknown, or shows from names and files.
+        What measured the points; '' if it is unknown, or shows from names and files.
     seed
-        Of the poses that are held out.
+        Of the random choice of poses that are held out.
 
     Raises
     ------
     InputError
         What is wrong, with the row or column.
     InsufficientDataError
-        The data do not fit the robot; which change would make them.
+        The data do not fit the robot; the message says which change would make them fit.
 
     Examples
     --------
@@ -170,6 +171,8 @@ def import_table(
 ) -> Session:
     """Make a session of one table with joints and points, or of two, as ``remaster import`` does.
 
+    Nothing is written to the disk.
+
     Parameters
     ----------
     files
@@ -177,9 +180,9 @@ def import_table(
     urdf, base_link, tip_link, never_mastered, sensor_kind, seed
         As of `session_from`.
     joints, points, time, names, join
-        Names of columns, and how two tables are joined, where that is not found.
+        Names of columns, and how two tables are joined, if that is not to be found by itself.
     angles, length
-        Units, where they are neither in the header nor guessed right.
+        Units, if they are neither in the header nor guessed right.
     sheets
         Of a workbook: the one with joints and points, or two.
     pulses_per_degree
@@ -195,7 +198,7 @@ def import_table(
     InputError
         What is wrong, with file, line and column.
     InsufficientDataError
-        The data do not fit the robot; which change would make them.
+        The data do not fit the robot; the message says which change would make them fit.
 
     Examples
     --------
@@ -274,7 +277,7 @@ def fit(session: Session, *, seed: int = 0, priors: Priors | None = None) -> Fit
 
 
 def discover(session: Session, *, seed: int = 0) -> Found:
-    """Find what the zero-offsets leave unexplained, and its physical cause.
+    """Search for the physical causes of the errors that zero-offsets leave.
 
     Parameters
     ----------
@@ -326,7 +329,7 @@ def simulate(
     outlier_share: float = 0.0,
     offset_std_rad: float | None = None,
 ) -> SimulatedRun:
-    """Measure an arm whose truth is drawn.
+    """Simulate the measurement of an arm with random true errors; nothing is written to the disk.
 
     Parameters
     ----------
@@ -335,7 +338,8 @@ def simulate(
     robot
         A URDF file, or the name of a shipped robot; None for that of the workcell.
     poses, validation_poses
-        Candidate poses to fit and to hold out; those that cannot be reached are dropped.
+        Number of candidate poses to fit and to hold out; those that cannot be reached are
+        dropped.
     effects
         What else is wrong, each as ``NAME[@JOINT][:MM]``, with the size in mm that it has after
         offsets, registration and marker are fitted.
@@ -354,8 +358,8 @@ def simulate(
     outlier_share
         Share of the observations that are 20 mm off.
     offset_std_rad
-        Of the true zero-offsets, rad; None for 0.3 degrees. A joint that slides has a metre for
-        each 1.2 rad.
+        Standard deviation of the true zero-offsets, rad; None for 0.3 degrees. A joint that slides
+        has 0.25 m for each rad.
 
     Raises
     ------
@@ -428,9 +432,10 @@ def plan(
     cell
         A workcell file, or the name of a shipped one.
     poses, validation_poses
-        Candidate poses to fit and to hold out; those that cannot be reached are dropped.
+        Number of candidate poses to fit and to hold out; those that cannot be reached are
+        dropped.
     seed
-        Of the candidates.
+        Of the random candidates.
 
     Raises
     ------

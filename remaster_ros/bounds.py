@@ -17,7 +17,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Bounds:
-    """Range of the numbers of a file; they are always finite."""
+    """Allowed range of the numbers of a field in a file, which must be finite in any case."""
 
     least: float = -math.inf
     most: float = math.inf
@@ -30,9 +30,9 @@ class Bounds:
     remedy: str = ''
 
     def problem(self, key: str, value: float) -> str:
-        """Return the error of a value, in one line with the remedy; '' if valid.
+        """Return what is wrong with a value, in one line with the remedy; '' if it is valid.
 
-        ``key``: its name in the line. NaN and infinite values are errors.
+        ``key``: name of the value in that line. NaN and infinite values are wrong.
         """
         if not math.isfinite(value):
             return f'{key}: {value} is not a finite number; correct it'

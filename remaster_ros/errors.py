@@ -29,11 +29,11 @@ class InputError(RemasterError):
 
 
 class DiskError(InputError):
-    """The disk does not take what is to be written; it may once there is room."""
+    """A disk refuses to write or read, as for lack of room; it may go on once that is mended."""
 
 
 class MovedError(DiskError):
-    """A folder that is written to has gone elsewhere; it may once it is put back."""
+    """A folder that is written to has been moved away; writing may go on once it is put back."""
 
 
 class InsufficientDataError(RemasterError):
@@ -41,14 +41,14 @@ class InsufficientDataError(RemasterError):
 
 
 class MisfitError(InsufficientDataError):
-    """The data are not those of this robot, as the session describes it.
+    """The data do not fit this robot, as the session describes it.
 
     Parameters
     ----------
     what
         What does not fit.
     remedy
-        What to check, where no mistake was found that explains it.
+        What to check, if no mistake is found that explains it.
     """
 
     def __init__(self, what: str, remedy: str) -> None:
@@ -61,14 +61,14 @@ class MisfitError(InsufficientDataError):
 
 
 class MistakeFoundError(InsufficientDataError):
-    """A misfit that a mistake in the session's tables explains.
+    """The data do not fit this robot, and a mistake in the session's tables explains it.
 
     Parameters
     ----------
     sentence
         What does not fit, and what mends it.
     options
-        Of ``remaster import SESSION``, which mends it; '' where the data cannot tell which.
+        Options of ``remaster import SESSION`` that mend it; '' if the data cannot tell which.
     """
 
     def __init__(self, sentence: str, options: str) -> None:
@@ -80,13 +80,14 @@ class MistakeFoundError(InsufficientDataError):
 
 
 class DeviceError(RemasterError):
-    """A device does not answer, or answers what it must not; names the device and the remedy."""
+    """A device does not answer, or answers wrongly; the message names it and the remedy."""
 
 
 def did_you_mean(word: str, words: Iterable[str]) -> str:
-    """Return "; did you mean 'other'?" with the word that is most like it; '' if none is.
+    """Return "; did you mean 'other'?" with the word of ``words`` that is most like ``word``.
 
-    Upper and lower case count as the same; `difflib.get_close_matches` decides.
+    '' if none is like it (`difflib.get_close_matches` decides). Upper and lower case count as
+    the same.
     """
     by_folded = {known.casefold(): known for known in words}
     close = get_close_matches(word.casefold(), by_folded, 1)

@@ -26,9 +26,10 @@ _Result = TypeVar('_Result')
 
 
 def one_thread(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]:
-    """Decorate what estimates or designs: it works in one thread, others as before.
+    """Decorate a function so that the BLAS library works in one thread while it runs.
 
-    The limit is of the whole process while the function works.
+    Of the whole process, so that other threads are limited meanwhile; afterwards the number is
+    as before.
     """
 
     @wraps(function)
@@ -43,10 +44,10 @@ def one_thread(function: Callable[_Given, _Result]) -> Callable[_Given, _Result]
 
 
 def svd(matrix: FloatArray, *, full_matrices: bool) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the singular value decomposition, as of `numpy.linalg.svd`.
+    """Return the singular value decomposition U, s, V', as `numpy.linalg.svd`.
 
-    LAPACK's divide and conquer does not converge for some finite matrices of hundreds of columns;
-    its older QR iteration does, and is taken then. Raises LinAlgError or ValueError if that fails
+    If LAPACK's divide and conquer does not converge, as for some finite matrices of hundreds
+    of columns, its older QR iteration is taken. Raises LinAlgError or ValueError if that fails
     too.
     """
     try:
@@ -60,7 +61,10 @@ def svd(matrix: FloatArray, *, full_matrices: bool) -> tuple[FloatArray, FloatAr
 
 @contextlib.contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Raise behind this block what Ctrl-C raises in it: in a callback of ctypes it is lost."""
+    """Context in which Ctrl-C is held back: its signal is raised again at the end of the block.
+
+    In a callback of ctypes it would be lost. Nothing is changed outside of the main thread.
+    """
     handler = signal.getsignal(signal.SIGINT)
     came: list[int] = []
     try:

@@ -24,18 +24,19 @@ SCREEN_HEIGHT = 620
 
 
 class Fit(FitResult):
-    """The result of `fit`: printed as a short table, in a notebook the report's first screen."""
+    """Result of `fit`: printed as a short table, in a notebook the first screen of its report."""
 
     @classmethod
     def of(cls, result: FitResult) -> Fit:
-        """Return a result as one that shows itself."""
+        """Return a `FitResult` as a `Fit`, with the same fields."""
         return cls(**{field.name: getattr(result, field.name) for field in fields(result)})
 
     @cached_property
     def joint_offsets_std_shown(self) -> FloatArray:
-        """Std of each offset with what links off their drawing do to it, rad or m, (k,).
+        """Standard deviations of the offsets if link lengths may differ from the drawing, (k,).
 
-        ``joint_offsets_std`` is that of an arm that is exactly its drawing.
+        rad or m, as reports show them. ``joint_offsets_std`` is that of an arm that is exactly
+        its drawing.
         """
         from remaster_ros.reports.loadable import uncertainty
 
@@ -54,14 +55,14 @@ class Fit(FitResult):
         return _first_screen(fit_html(self, {}))
 
     def figures(self) -> dict[str, Figure]:
-        """Return the report's figures by name; nothing is written."""
+        """Return the plots of the report (matplotlib figures) by name; no file is written."""
         from remaster_ros.reports.figure_style import as_figures
         from remaster_ros.reports.fit_figures import fit_figures
 
         return as_figures(fit_figures(self), self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write what ``remaster fit --out`` writes, the files for the robot among it.
+        """Write what ``remaster fit --out`` writes into a folder, with the files for the robot.
 
         Returns
         -------
@@ -81,11 +82,11 @@ class Fit(FitResult):
 
 
 class Found(Discovery):
-    """The result of `discover`, shown in the same ways as `Fit`."""
+    """Result of `discover`: printed as a short table, in a notebook its report's first screen."""
 
     @classmethod
     def of(cls, found: Discovery) -> Found:
-        """Return a result as one that shows itself."""
+        """Return a `Discovery` as a `Found`, with the same fields."""
         return cls(**{field.name: getattr(found, field.name) for field in fields(found)})
 
     def __repr__(self) -> str:
@@ -107,14 +108,17 @@ class Found(Discovery):
         return discovery_content(self)
 
     def figures(self) -> dict[str, Figure]:
-        """Return the report's figures by name; nothing is written."""
+        """Return the plots of the report (matplotlib figures) by name; no file is written."""
         from remaster_ros.reports.discovery_figures import discovery_figures
         from remaster_ros.reports.figure_style import as_figures
 
         return as_figures(discovery_figures(self), self)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write what ``remaster discover --out`` writes; return the report as `Fit.save`."""
+        """Write what ``remaster discover --out`` writes to a folder; return the report's path.
+
+        Raises InputError as `Fit.save`.
+        """
         from remaster_ros.reports.fit_json import DISCOVERY_FILE
         from remaster_ros.reports.result_folder import prepare_folder, save_discovery
 
@@ -123,7 +127,7 @@ class Found(Discovery):
 
 
 def _first_screen(page: str) -> str:
-    """Return a page down to its contents list, in a frame that keeps its style to itself."""
+    """Return an HTML page up to its contents list, in an iframe that keeps its style to itself."""
     screen = page.partition('<nav>')[0] + '<p class="soft">Files: save(folder).</p>'
     return (
         f'<iframe srcdoc="{html.escape(screen)}" title="first screen of the report" '

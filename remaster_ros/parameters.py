@@ -29,17 +29,17 @@ def parameter(
     Parameters
     ----------
     default
-        Its value where the user gives none; its type is the parameter's type.
+        Its value if the user gives none; its type is the parameter's type.
     description, unit
         For the user; shown by ``ros2 param describe``.
     low, high
         Smallest and largest allowed value, both included.
     off
-        The value outside of them by which it is switched off; None where there is none.
+        The value outside of them by which it is switched off; None if there is none.
     choices
         The allowed words of a text parameter.
     live
-        Whether it can be changed while the node runs, where the node has an `on_change`.
+        Whether it can be changed while the node runs, if the node has an `on_change`.
     """
     metadata = {
         'description': description,
@@ -54,19 +54,21 @@ def parameter(
 
 
 def parameter_fields(kind: Any) -> dict[str, dataclasses.Field[Any]]:
-    """Return the fields of a dataclass that were made by `parameter`, by name."""
+    """Return the fields of a dataclass or its instance that were made by `parameter`, by name."""
     return {field.name: field for field in dataclasses.fields(kind) if field.metadata}
 
 
 def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
-    """Return `value` as the field's type; an int is converted for a float, nothing else.
+    """Return a parameter's value if it is valid; an int is converted for a float, nothing else.
 
     Parameters
     ----------
     owner
-        Whose parameter it is, for the message.
+        Name of the node or driver that has the parameter, for the message.
     field
         Made by `parameter`.
+    value
+        The value to check.
 
     Raises
     ------
@@ -94,10 +96,11 @@ def check(owner: str, field: dataclasses.Field[Any], value: Any) -> Any:
 
 
 def check_all(owner: str, values: Any) -> None:
-    """Check every field of `values` that was made by `parameter`; nothing is changed.
+    """Check every field of ``values``, an instance, that was made by `parameter`.
 
-    ``owner``: whose parameters they are, for the message. Raises InputError, which names owner and
-    field, for the first value of another type, out of range, or none of the choices.
+    Nothing is changed or converted. ``owner``: name of the node or driver that has the
+    parameters, for the message. Raises InputError, which names owner and field, for the first
+    value of another type, out of range, or none of the choices.
     """
     for name, field in parameter_fields(values).items():
         check(owner, field, getattr(values, name))
@@ -105,7 +108,7 @@ def check_all(owner: str, values: Any) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class SimulationParameters:
-    """What nodes with watchdogs need in a simulation; their parameters derive from this."""
+    """Base of the parameters of nodes whose watchdogs follow the clock of a simulation."""
 
     simulated_clock_rate: float = parameter(
         0.0,

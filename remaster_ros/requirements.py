@@ -25,7 +25,7 @@ WRONG_ENVIRONMENT = 2
 
 
 def missing_packages() -> str:
-    """Names and remedy of the packages of `FROM_PIP` that are not installed; '' if none is."""
+    """Error line on the packages of `FROM_PIP` that are not installed; '' if none is missing."""
     missing = [name for name, module in FROM_PIP.items() if find_spec(module) is None]
     if not missing:
         return ''
@@ -36,9 +36,10 @@ def missing_packages() -> str:
 
 
 def end_without_packages() -> None:
-    """End the program with one line on stderr if a package is missing.
+    """End the program, with one line on stderr, if a package of `FROM_PIP` is not installed.
 
-    Raises SystemExit with the status `WRONG_ENVIRONMENT`; nothing if none is missing.
+    Raises SystemExit with the status `WRONG_ENVIRONMENT`, 2; nothing happens if none is
+    missing.
     """
     if message := missing_packages():
         print(message, file=sys.stderr)

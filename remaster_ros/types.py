@@ -69,24 +69,24 @@ class Observation:
     Attributes
     ----------
     q, from_q
-        Reported joint positions, and those it came from (None where unknown), rad, (k,).
+        Reported joint positions, and those it came from (None if unknown), rad, (k,).
     position, std
         Mean marker position in N over the dwell, and the samples' standard deviation
         (None for a single shot), m, (3,).
     samples
-        How many samples the mean has; None where unknown.
+        How many samples the mean has; None if unknown.
     frame
         Observations of one sensor with the same number come from one frame of it and share its
-        error; None where this one shares none.
+        error; None if this one shares none.
     orientation
         Mean orientation of the measured body in N over the dwell, unit quaternion x, y, z, w,
-        (4,); None where it was not measured.
+        (4,); None if it was not measured.
     wanted
-        The reported joint positions less what a correction changed, rad, (k,); None where unknown.
+        The reported joint positions less what a correction changed, rad, (k,); None if unknown.
     correction
-        Whether a correction was on; None where unknown.
+        Whether a correction was on; None if unknown.
     effort
-        Measured joint torques, N m, (k,), NaN where unknown; None where none is known.
+        Measured joint torques, N m, (k,), NaN where unknown; None if none is known.
     velocity, acceleration
         Of the joints when the marker was measured, rad/s and rad/s², (k,); None of an arm that
         stood still.
@@ -116,7 +116,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class BasePrior:
-    """A sensor's registration known beforehand: T_R_N, the sensor frame N in the robot base R.
+    """Prior of a sensor's registration T_R_N: pose of its frame N in the robot base frame R.
 
     Attributes
     ----------
@@ -136,7 +136,7 @@ class BasePrior:
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known before a fit, in place of what the session states.
+    """What is known before a fit of offsets, markers and sensor poses, instead of the session's.
 
     Attributes
     ----------
@@ -231,7 +231,7 @@ class Measurements:
 
     @classmethod
     def empty(cls, joints: int) -> Measurements:
-        """Return no observations, n = 0, of an arm with that many joints."""
+        """Return measurements without rows, n = 0, of an arm with this number of joints."""
         integers, numbers = np.zeros(0, np.int64), np.zeros(0)
         return cls(
             observation=integers,
@@ -250,7 +250,7 @@ class Measurements:
         )
 
     def select(self, rows: BoolArray | IntArray) -> Measurements:
-        """Return the given rows (a mask or indices), in that order, as new arrays."""
+        """Return a copy with only the given rows (a mask or indices), in that order."""
         columns: dict[str, Any] = {
             name: None if value is None else value[rows] for name, value in vars(self).items()
         }
@@ -259,9 +259,10 @@ class Measurements:
 
 @dataclass(frozen=True)
 class PadJoint:
-    """How a robot's own pad writes one joint.
+    """Name, unit, sign and zero with which a robot's own pad (teach pendant) shows one joint.
 
-    The URDF's angle is ``sign`` times the pad's, with those coupled to it added, + ``zero_deg``.
+    The URDF's angle is ``sign`` times the pad's, with those coupled to it added, +
+    ``zero_deg``.
 
     Attributes
     ----------
@@ -286,14 +287,14 @@ class PadJoint:
 
 @dataclass(frozen=True)
 class Controller:
-    """How a robot's own pad writes the joints of the URDF.
+    """Conversion of joint angles between a robot's own pad (teach pendant) and the URDF.
 
     Attributes
     ----------
     joints
         Joint of the URDF -> how the pad writes it, base to tip.
     maker
-        Of the controller; '' where it is not known.
+        Of the controller; '' if it is not known.
     """
 
     joints: Mapping[str, PadJoint]
@@ -306,14 +307,14 @@ BRIDGE = 'robot_bridge'
 
 @dataclass(frozen=True)
 class Correction:
-    """The correction that was on while a session was measured.
+    """Correction (form and file) that was on while a session was measured.
 
     Attributes
     ----------
     form
         In which it was loaded, such as ``pad`` or ``urdf``.
     sha256
-        Of its compensation.json; '' where unknown.
+        Of its compensation.json; '' if unknown.
     """
 
     form: str
@@ -321,17 +322,17 @@ class Correction:
 
     @property
     def is_inside(self) -> bool:
-        """Whether it is in the controller: the joint angles that this reports have it in them.
+        """Whether the correction is in the controller, so that reported joint angles contain it.
 
-        The forms are pad, rising and ros2_control; False for an unknown form.
+        True for the forms pad, rising and ros2_control; False for an unknown form.
         """
         return self.form in ('pad', 'rising', 'ros2_control')
 
     @property
     def is_beside(self) -> bool:
-        """Whether it is outside of the controller, whose joint angles are as without it.
+        """Whether the correction is outside of the controller, so that reported angles lack it.
 
-        The forms are that of the bridge, layer and urdf; False for an unknown form.
+        True for the forms of the bridge (`BRIDGE`), layer and urdf; False for an unknown form.
         """
         return self.form in (BRIDGE, 'layer', 'urdf')
 
@@ -340,7 +341,7 @@ class Correction:
 
 
 def _end(joint: ElementTree.Element, end: str) -> str:
-    """Return the link at an end of a joint, ``parent`` or ``child``; '' if it has none."""
+    """Name of the link at an end of a URDF's joint, ``parent`` or ``child``; '' if it has none."""
     found = joint.find(end)
     return '' if found is None else found.get('link', '')
 
@@ -441,7 +442,7 @@ class Session:
 
     @property
     def slides(self) -> tuple[bool, ...]:
-        """Whether each joint slides, base to tip, (k,): its positions are in m."""
+        """Whether each joint slides (is prismatic, positions in m), base to tip, (k,)."""
         joints = ElementTree.fromstring(self.urdf).findall('joint')
         carrying = {_end(joint, 'child'): joint for joint in joints}
         kinds, link = list[str | None](), self.tip_link
@@ -460,9 +461,10 @@ class Session:
         )
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the rows as columns by their names in observations.csv, for a data frame.
+        """Return the measurements as columns by their names in observations.csv, for a data frame.
 
-        What no row has is left out; an unknown number is NaN, an unknown count -1.
+        References are left out, and columns that no row has; an unknown number is NaN, an
+        unknown count -1.
 
         Returns
         -------
@@ -508,19 +510,20 @@ class Session:
 
     @property
     def sensor_names(self) -> tuple[str, ...]:
-        """Sensor names in index order."""
+        """Sensor names, at the indices that ``measurements.sensor`` has."""
         return tuple(self.sensors)
 
     @property
     def marker_names(self) -> tuple[str, ...]:
-        """Marker names in index order."""
+        """Marker names, at the indices that ``measurements.marker`` has."""
         return tuple(self.markers)
 
     @property
     def is_corrected(self) -> BoolArray:
-        """Whether a correction was on, (n,), row by row.
+        """Mask of the measurements with a correction on, (n,).
 
-        Unknown rows count as on if the session states a correction, else as off.
+        Rows of which it is unknown count as on if the session states a correction, else as
+        off.
         """
         given, unknown = self.measurements.correction, self.correction is not None
         if given is None:
@@ -529,10 +532,10 @@ class Session:
 
     @property
     def correction_note(self) -> str:
-        """Sentence on what zero-offsets of the reported angles are beside the correction.
+        """Sentence on whether zero-offsets found here come on top of the correction.
 
-        '' if no row has one on. For one in the controller they come on top, for one beside it they
-        take its place; for an unknown form it says what to state.
+        '' if it is on in no row. If it is in the controller, they come on top of it; if it is
+        outside, they take its place; if its form is unknown, the sentence asks for it.
         """
         on = self.is_corrected
         if not on.any():
@@ -556,14 +559,16 @@ class Session:
         )
 
     def positions_alone(self) -> Session:
-        """Return the session without the measured orientations."""
+        """Return a copy of the session without the measured orientations."""
         without = replace(self.measurements, orientation=None)
         return replace(self, measurements=without, oriented=frozenset())
 
     def through_correction(self) -> Session:
-        """Return the rows with the correction on as the nominal robot: at the angles wanted.
+        """Return the rows with the correction on, as of the nominal robot at the angles wanted.
 
-        What is found of them is what remains beside the correction, and nothing to be loaded.
+        A new session whose ``q`` is what was ``wanted``; previous angles are unknown, and it
+        has no references and states no correction. What a fit finds in it is the error that
+        the correction leaves; it must not be loaded as a correction.
 
         Raises
         ------
@@ -584,8 +589,8 @@ class Session:
         return replace(found, measurements=plain)
 
     def select(self, rows: BoolArray | IntArray) -> Session:
-        """Return this session with only the given rows (a mask or indices), in that order.
+        """Return a copy of the session with only the given rows (mask or indices), in that order.
 
-        References stay; the checksum of the observations is '' then.
+        References stay; ``observations_sha256`` is ''.
         """
         return replace(self, measurements=self.measurements.select(rows), observations_sha256='')

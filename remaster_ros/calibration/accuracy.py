@@ -51,10 +51,11 @@ def unavailable(names: Sequence[str], why: str) -> dict[str, Any]:
 
 
 def solution_pairs(measurements: Measurements, rng: np.random.Generator) -> IntArray:
-    """Rows i < j seen by the same sensor on the same marker at the same pose, (m, 2).
+    """Pairs (i, j), i < j, of rows that are different joint solutions of the same pose, (m, 2).
 
-    The sums of eq. 17 of Van Wyk et al.; rows of one configuration are the same solution and make
-    no pair, nor do those of an arm that moved. At most 200,000 pairs, drawn at random from more.
+    Rows by the same sensor on the same marker, over which eq. 17 of Van Wyk et al. sums. Rows
+    of one configuration make no pair; those of a session measured in motion make none at all.
+    At most 200,000 pairs, drawn at random from more.
     """
     if measurements.velocity is not None:
         # Rows of a moving arm's segment are no solutions of one pose.
@@ -182,10 +183,11 @@ def _measured(
 
 
 def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
-    """Summaries of the invariant version and of the paper's version, in this order in ``both``.
+    """Theoretical metrics as fit.json has them: summaries of the distances of both versions.
 
-    Keys are 'theoretical' and 'paper_theoretical', each with the suffix; values are `summary` of
-    each field of `Distances`.
+    ``both``: distances of the invariant version and of the paper's. Keys are 'theoretical' and
+    'paper_theoretical', each with the suffix; values are `summary` of each field of
+    `Distances`.
     """
     return {
         name + suffix: {side: summary(values) for side, values in distances._asdict().items()}

@@ -97,10 +97,10 @@ class Arrangement:
 
     @property
     def changes(self) -> int:
-        """Number of changes from the given arrangement, 0 if there is none; rare ones count twice.
+        """Number of changes from a table that needs none (`given`), which has 0.
 
         Two exchanged columns count as one change, each reversed or quarter-turned joint as one;
-        mirrored points and a turned tool count as two.
+        mirrored points and a turned tool count as two, as they are rare.
         """
         # Two that are exchanged are one thing, and so are all of them tip to base.
         moved = sum(column != joint for joint, column in enumerate(self.order)) // 2
@@ -149,7 +149,7 @@ class Arrangement:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """Robust fit of one arrangement."""
+    """Robust fit of a session with its table arranged in one way: errors and zero-offsets."""
 
     arrangement: Arrangement
     error_m: float  # Median distance of the points from the fit, m
@@ -174,7 +174,7 @@ class Fitted:
 
     @property
     def worst_error_m(self) -> float:
-        """Larger one of the median and the scaled quantile, m."""
+        """Error of the fit, m: the larger of its median and its scaled 90 % quantile."""
         return max(self.error_m, self.most_error_m)
 
 
@@ -354,11 +354,12 @@ def determined_offsets(
 def linear_errors(
     chain: SerialChain, session: Session, arrangements: Sequence[Arrangement]
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors of arrangements in the linear problem, as shares of the points' extent.
+    """Errors of arrangements in a linear problem, as shares of the points' extent.
 
-    Only the sensor and marker with most rows are used. Returns errors: median distance over the
-    extent of the points, (arrangements,); and scales: metres of the robot for one unit of the
-    points, negative if G mirrors them.
+    The problem is T_R_T(q) · marker = G p + t (see the module), with a free 3×3 matrix G. Only
+    the sensor and marker with most rows are used, at most 40 rows. Returns errors: median
+    distance over the extent of the points, (arrangements,); and scales: metres of the robot for
+    one unit of the points, negative if G mirrors them.
     """
     m = session.measurements
     rows = max(streams(m), key=len)
@@ -379,6 +380,8 @@ def linear_fit(
     chain: SerialChain, q: FloatArray, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Errors of joints against points in the linear problem, whatever the points' unit.
+
+    The problem is T_R_T(q) · marker = G p + t (see the module), with a free 3×3 matrix G.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Residuals and accuracy without and with the offsets."""
+    """Registrations and residuals with the offsets at zero, and accuracy without and with them."""
 
     T_R_N_before: Mapping[str, FloatArray]  # Registrations with the offsets at zero, by sensor
     # Measured minus modelled position in N with the offsets at zero, all rows, m, (n, 3)
@@ -36,11 +36,11 @@ def compared(
     predictive: Predictive,
     rng: np.random.Generator,
 ) -> Comparison:
-    """Compare a fit with the fit with offsets at zero.
+    """Compare a fit with the same fit with all offsets at zero.
 
-    ``problem``: the fitted problem; ``kept``: indices of the fitted rows that count; ``before,
-    after``: pinned parameters with offsets at zero and as estimated, (size,); ``predictive``:
-    posterior for predictions; ``rng``: for the theoretical metric.
+    ``problem``: the fitted problem; ``kept``: indices of the fitted rows that are no gross
+    errors; ``before, after``: pinned parameters with offsets at zero and as estimated, (size,);
+    ``predictive``: posterior for predictions; ``rng``: for the theoretical metric.
     """
     model, measurements = predictive.model, problem.measurements
     predicted_before = predicted_rows(problem, model, before)

@@ -67,10 +67,10 @@ def ess_tail(draws: FloatArray) -> FloatArray:
 
 
 def _figures(of: Callable[[FloatArray], FloatArray], draws: FloatArray) -> FloatArray:
-    """Apply a diagnostic to draws (chains, draws, ...), for each quantity, (...).
+    """Apply a diagnostic to each quantity of draws (chains, draws, ...), (...).
 
-    ``of``: function of draws (chains, draws, quantities). Raises InsufficientDataError for short
-    chains.
+    ``of``: the diagnostic, from draws (chains, draws, quantities) to (quantities,). NaN for a
+    constant quantity. Raises InsufficientDataError with fewer than 8 draws in a chain.
     """
     length = draws.shape[1]
     if length < MINIMUM_DRAWS:
@@ -153,7 +153,10 @@ def _effective(draws: FloatArray) -> FloatArray:
 
 
 class Diagnostics(NamedTuple):
-    """Diagnostics of the draws of each of p parameters, (p,); no R-hat (NaN) without chains."""
+    """R-hat, and effective draws of bulk and tails, of p parameters; no R-hat without chains.
+
+    Arrays (p,); R-hat is NaN for draws of the Gaussian about the mode, which are no chains.
+    """
 
     r_hat: FloatArray
     ess_bulk: FloatArray
@@ -161,10 +164,10 @@ class Diagnostics(NamedTuple):
 
     @classmethod
     def of(cls, run: Chains) -> Diagnostics:
-        """R-hat and effective draws of a sampler's parameters, (p,) each.
+        """R-hat and effective numbers of draws of a sampler's parameters, (p,) each.
 
-        Those that `run` has are taken over, else computed. For draws of the Gaussian about the
-        mode R-hat is NaN and both effective numbers are ``run.effective``.
+        Those of ``run.figures`` if it has them, else computed. For draws of the Gaussian about
+        the mode R-hat is NaN and both effective numbers are ``run.effective``.
         """
         if run.method == 'metropolis':
             draws = run.draws
@@ -224,10 +227,12 @@ class SamplerInfo(Struct, frozen=True):
     ) -> SamplerInfo:
         """Convergence of the draws of p named parameters, with a sentence for the report.
 
-        Converged: every R-hat at most 1.01 and the least effective number of draws at least 1 /
-        ``wanted``², or 400 if ``wanted`` is None. ``names``: of the parameters, p; ``name``: of
-        the sampler; ``weakest``: parameters that the observations determine worst together, which
-        the sentence names for a Gaussian about the mode.
+        Converged: the least effective number of draws is at least 1 / ``wanted``², or 400 if
+        ``wanted`` is None, and every R-hat at most 1.01, or, for a Gaussian about the mode, no
+        chains were given up. ``names``: of the parameters, p; ``name``: of the sampler;
+        ``seconds``: computing time, None if unknown; ``weakest``: parameters that the
+        observations determine worst together, which the sentence names for a Gaussian about the
+        mode.
         """
         needed = ESS_LIMIT if wanted is None else wanted**-2
         least = float(np.min(diagnostics[1:]))
@@ -276,5 +281,5 @@ class SamplerInfo(Struct, frozen=True):
 
 
 def _known(figure: float) -> float | None:
-    """Figure; None for NaN."""
+    """The number itself; None for NaN."""
     return None if np.isnan(figure) else figure

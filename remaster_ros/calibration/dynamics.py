@@ -66,7 +66,10 @@ MODES = tuple(f'tool_mode_{by}{axis}' for by in ('', 'out_') for axis in 'xyz')
 
 @dataclass(frozen=True, eq=False)
 class MotionColumns:
-    """Functions of a row's motion, n rows and k joints; 0 where the arm stood still."""
+    """Motion of n rows and k joints, and what the parameters of motion do to each row.
+
+    A row without rates has friction only if the arm has come to rest there (`turned`).
+    """
 
     chain: SerialChain
     q: FloatArray  # With zero-offsets, rad, (n, k)
@@ -77,10 +80,12 @@ class MotionColumns:
 
     @classmethod
     def of(cls, chain: SerialChain, m: Measurements, offsets: FloatArray) -> MotionColumns:
-        """Functions of the motion of n measurements with velocities; NaN rates count as 0.
+        """Motion of n measurements that have velocities: joints, rates, times, turning points.
 
-        Velocities of 0 are of an arm that has come to rest, whose ``from_q`` is where each joint
-        turned last. ``offsets``: zero-offsets added to the joints, rad or m, (k,).
+        NaN rates of an arm that stood still count as 0, with friction 0. A row with velocities
+        0 is of an arm that has come to rest: its friction follows from the way since
+        ``from_q``, where each joint turned last. ``offsets``: zero-offsets added to q, rad or
+        m, (k,).
         """
         assert m.velocity is not None
         assert m.acceleration is not None
@@ -90,7 +95,7 @@ class MotionColumns:
         return cls(chain, m.q + offsets, *rates, m.stamp_s, turned + offsets)
 
     def at(self, rows: IntArray) -> MotionColumns:
-        """Functions of some rows, by their indices; friction is that of the path of all rows."""
+        """Motion of some rows, by their indices; friction is that along the path of all rows."""
         return _PartOfMotion(
             self.chain,
             self.q[rows],
@@ -104,7 +109,7 @@ class MotionColumns:
 
     @cached_property
     def links(self) -> MovingLinks:
-        """Motion of the links, computed once."""
+        """Velocities and accelerations of the arm's links in the rows, computed once."""
         return MovingLinks.of(self.chain, self.q, self.velocity, self.acceleration)
 
     def jacobian(self, places: FloatArray) -> FloatArray:
@@ -116,10 +121,11 @@ class MotionColumns:
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """Shares of each joint's friction, -1 to 1, (n, k): by the short travel, and its change.
+        """Friction of each joint as a share of its full torque, by two travels, (n, k) each.
 
-        The second result is the share by the long travel less that by the short one
-        (`TRAVELS_RAD`, times ``per_radian``).
+        A travel is the way within which friction reverses (`TRAVELS_RAD`, times
+        ``per_radian``). The first result is the share by the short travel, -1 to 1; the second
+        is that by the long travel less the first.
         """
         soon, late = (
             friction_share(
@@ -131,14 +137,15 @@ class MotionColumns:
 
     @cached_property
     def inertial_torque(self) -> FloatArray:
-        """Torque of the links' inertia about each joint, N m, (n, k)."""
+        """Torque of the links' inertia about each joint, N m, or N for a slide, (n, k)."""
         return self.links.inertial_torque()
 
     def swing(self, middle: FloatArray) -> FloatArray:
-        """Displacement by a mode along each axis of the tool, m per s², (n, 3, 6).
+        """Displacement in R by an elastic mode along each axis of the tool, m per s², (n, 3, 6).
 
-        The first three are driven by the acceleration of the tool frame, the others by that of the
-        middle of the markers, m, (3,), in this frame.
+        Columns are per unit of 1 / (2 π f)² of the mode's frequency f. The first three are
+        driven by the acceleration of the tool frame's origin, the others by that of ``middle``,
+        the middle of the markers in the tool frame, m, (3,), relative to it.
         """
         tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
         frame = self.links.point_acceleration(tool[:, :3, 3])
@@ -154,14 +161,14 @@ class MotionColumns:
 
 @dataclass(frozen=True, eq=False)
 class _PartOfMotion(MotionColumns):
-    """Functions of some rows, with the friction along the path of all rows."""
+    """Motion of some rows of a session, with the friction along the path of all its rows."""
 
     whole: MotionColumns
     rows: IntArray
 
     @cached_property
     def friction(self) -> tuple[FloatArray, FloatArray]:
-        """Shares of friction of these rows, as computed along the path of all rows."""
+        """`MotionColumns.friction` of these rows, computed along the path of all rows."""
         soon, late = self.whole.friction
         return soon[self.rows], late[self.rows]
 
@@ -174,13 +181,17 @@ def friction_share(
     travel: FloatArray,
     turned: FloatArray | None = None,
 ) -> FloatArray:
-    """Share of its full torque that friction has, the mean over each row, (n, k).
+    """Friction of each joint as a share of its full torque, the mean over each row, (n, k).
 
-    After each reversal friction reverses within a travel, (k,), of the joint: in Dahl's model
-    (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed exponentially. It
-    is followed along neighbouring rows, and begins with what the way of a row at its speed leaves:
-    that sign, or nothing of a joint that hardly moves. An arm at rest keeps the share
-    that it has come with since its joints ``turned``, (n, k); where that is NaN it is 0.
+    After each reversal friction reverses within a ``travel`` of the joint, rad or m, (k,): in
+    Dahl's model (1968, Aerospace Corp. TOR-0158) the share approaches the sign of the speed
+    exponentially. It is followed from row to row. After a gap of more than `LONGEST_GAP_S` it
+    begins anew, with the sign of the speed, and near 0 for a joint that hardly moves within a
+    row.
+
+    In rows in which no joint moves it is 0; with ``turned``, the positions at which the joints
+    turned last, (n, k), it is what the way since then leaves, and 0 where that is NaN.
+    ``seconds``: times of the rows, s, (n,); ``q``, ``velocity``, ``acceleration``: (n, k).
     """
     moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
     q, velocity, acceleration = q[first], velocity[first], acceleration[first]
@@ -216,9 +227,11 @@ def friction_share(
 def dynamic_extension(
     chain: SerialChain, m: Measurements, sensor_names: tuple[str, ...], markers: FloatArray
 ) -> Extension:
-    """Extension with the parameters of motion, for all rows of the measurements.
+    """Extension of the model by the parameters of motion, for all rows of the measurements.
 
-    ``markers``: nominal positions in the tool frame, m, (markers, 3).
+    They are each sensor's clock and its drift, each joint's lag, friction and inertia, and the
+    tool's modes (see the module). The measurements have velocities. ``markers``: nominal
+    positions in the tool frame, m, (markers, 3).
     """
     k = len(chain)
     columns = MotionColumns.of(chain, m, np.zeros(k))
@@ -289,9 +302,10 @@ def dynamic_extension(
 
 
 def estimate_moving(problem: Problem) -> Estimate:
-    """Mode with the parameters of motion, under noise that is correlated along the path.
+    """Estimate with the parameters of motion, under noise that is correlated along the path.
 
-    Raises as `estimate`.
+    A first fit under independent noise gives the correlations; if no sensor has enough frames
+    for them (`noise_along_path`), it is the result. Raises as `estimate`.
     """
     extension = dynamic_extension(
         problem.chain, problem.measurements, problem.sensor_names, problem.markers
@@ -307,16 +321,17 @@ def estimate_moving(problem: Problem) -> Estimate:
 
 
 def estimate_beside(moving: Estimate, problem: Problem) -> Estimate:
-    """Estimate without parameters of motion, under the path noise of a fit that has them.
+    """Estimate of a moving session without parameters of motion, for comparison.
 
-    Its errors contain the contributions of motion. ``moving``: of `estimate_moving`; ``problem``:
-    to be fitted. Raises as `estimate`.
+    Clocks, lags, friction, inertia and the tool's modes stay in its errors. Its noise has the
+    correlations along the path, if any, of ``moving``, an estimate with these parameters by
+    `estimate_moving`. ``problem``: to be fitted. Raises as `estimate`.
     """
     return estimate(replace(problem, path_noise=moving.problem.path_noise))
 
 
 def noise_along_path(found: Estimate) -> PathNoise | None:
-    """Correlations of a fit's errors along the path, for all sensors in turn.
+    """Correlations of a fit's position errors along the path, estimated sensor by sensor.
 
     None if no sensor has 40 frames (`FEWEST_FRAMES`); a sensor with fewer has no correlations.
     """
@@ -358,11 +373,11 @@ def moving_words(found: Estimate) -> str:
 
 
 def friction_at_rest(found: Estimate) -> FloatArray:
-    """Variance of each row's marker by the friction of a resting arm, m² of its length, (n,).
+    """Variance of each row's marker position by unknown friction of an arm at rest, m², (n,).
 
-    How friction turns round within its travel is known to the two travels of the model alone: the
-    std of a joint's share is taken for half of the difference of both. 0 in motion, and without
-    parameters of motion.
+    It is that of the error's length. The standard deviation of a joint's share of friction is
+    taken for half of the difference between the shares by the model's two travels. 0 in motion,
+    and for a fit without parameters of motion.
     """
     m, extension, model = found.problem.measurements, found.model.extension, found.model
     variance = np.zeros(len(m))
@@ -380,9 +395,11 @@ def friction_at_rest(found: Estimate) -> FloatArray:
 
 
 def clocks_of(found: Estimate) -> dict[str, tuple[float, float]]:
-    """Delay of stamps to those of the joints, and its standard deviation, s, by sensor.
+    """Delay of each sensor's stamps against the joints', and its standard deviation, s, by name.
 
-    Of sensors that measured in motion; {} for a fit without parameters of motion.
+    Negative if the stamps are early. What the import has corrected already (``clock_offset_s``
+    of the session) is included. Only sensors that measured in motion; {} for a fit without
+    parameters of motion.
     """
     extension, model = found.model.extension, found.model
     if extension is None or not extension.of_motion:

@@ -177,10 +177,11 @@ class Problem:
         )
 
     def plausibility(self, model: Model, free: IntArray) -> tuple[Prior, ...]:
-        """Wide prior (5 degrees, `plausible_offsets`) on free offsets without a stated prior.
+        """Gaussian prior on the free joint offsets that have no stated one, in a tuple.
 
-        One `Prior` for all of them, or () if there are none. ``free``: indices of parameters, of
-        which those below k are joints.
+        As `plausible_offsets`: 5 degrees about 0; with the effects of a discovery in the model,
+        its ``step_std`` about the offsets of its search. () if all free offsets have a stated
+        prior. ``free``: indices of parameters; those below k are joints.
         """
         unknown = [
             joint
@@ -424,11 +425,11 @@ def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
 
 
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
-    """Gauge found again at the mode if an offset is badly determined, else the given gauge.
+    """Gauge found again at the mode if an offset is badly determined there, else the given gauge.
 
-    Badly: a standard deviation above 0.2 degrees (`WEAK_ANGLE`) without a reason in the gauge. The
-    given gauge was found at the start, which may lie far from the mode along such a direction. It
-    is kept if the new one would hold other parameters.
+    Badly: a standard deviation above 0.2 degrees (`WEAK_ANGLE`) without a reason in the gauge.
+    The given gauge was found at the start, which may lie far from the mode along such a
+    direction. It is kept if the new one would hold other parameters fixed.
     """
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))

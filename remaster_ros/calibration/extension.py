@@ -16,7 +16,7 @@ from remaster_ros.types import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """Effect of some of the parameters at one place."""
+    """Effect of some parameters of an extension on the angle of one joint, or on the marker."""
 
     where: slice  # Slice of the parameters
     # Index of the joint whose angle they change; None if they displace the marker
@@ -69,10 +69,10 @@ class Extension:
     of_motion: bool = False  # What every fit of a moving session has (`dynamics`): no causes
 
     def with_motion(self, other: Extension | None) -> Extension:
-        """These parameters and behind them those of motion of another extension.
+        """Copy with the parameters of motion of another extension appended to its own.
 
-        The same extension if ``other`` is None or has no parameters of motion (``of_motion``). The
-        other has to be linearised at 0, as parameters of motion are.
+        The same extension if ``other`` is None or has no parameters of motion (``of_motion``).
+        The other has to be linearised at 0, as parameters of motion are.
         """
         if other is None or not other.of_motion:
             return self
@@ -121,7 +121,7 @@ class Extension:
     def derivative(
         self, by_joints: FloatArray, turn: FloatArray, rows: IntArray, result: FloatArray
     ) -> None:
-        """Add the derivative of n points by theta, m per unit, to ``result``, (n, 3, m).
+        """Add the derivative of n points by theta, m per unit, to ``result``, (n, 3, m), in place.
 
         Parameters
         ----------
@@ -131,6 +131,8 @@ class Extension:
             Rotation applied to displacements, (3, 3).
         rows
             Indices of the points in the measurements, (n,).
+        result
+            Array to which the derivative is added.
         """
         for term in self.terms:
             part, values = result[:, :, term.where], term.values[rows]

@@ -161,7 +161,11 @@ def hardly_seen(names: Sequence[str], loadings: FloatArray) -> str:
 
 
 def the(kind: str, name: str) -> str:
-    """'the sensor mocap'; or 'the sensor' and 'sensor_2' if the name contains the kind."""
+    """Name after its kind: 'the sensor mocap', for ``kind`` 'sensor' and ``name`` 'mocap'.
+
+    'the sensor' if the name is the kind; the name alone, as 'sensor_2', if it begins with it.
+    Case does not matter.
+    """
     if name.lower() == kind:
         return f'the {kind}'
     return name if name.lower().startswith(kind) else f'the {kind} {name}'

@@ -78,10 +78,10 @@ def p_value_limits(shares: tuple[float, ...], error_rate: float) -> tuple[float,
 def _above(
     limit: float, grid: FloatArray, density: FloatArray, place: float, width: float, step: float
 ) -> float:
-    """Probability of an alarm at this look less ``step``, the error rate to be spent at it.
+    """Probability that the first alarm comes at this look, less ``step``, the error rate for it.
 
     ``limit``: of the statistic; ``grid, density``: values of statistic times share before this
-    look, and their probabilities without earlier alarms; ``place``: share of all data; ``width``:
-    standard deviation of the increase.
+    look, and their probabilities without earlier alarms; ``place``: share of all data;
+    ``width``: standard deviation of the increase since the look before.
     """
     return float(density @ scipy.special.ndtr((grid - limit * place) / width)) - step

@@ -110,8 +110,9 @@ class Rows:
     ) -> Rows:
         """Positions as of `of`, and behind them the orientations of bodies, where they are finite.
 
-        ``on_tool`` are indices of sensors on the tool: see ``lever``. The same as `of` without
-        bodies or measured orientations.
+        ``bodies``: (sensor, marker) of each, indices; ``on_tool``: indices of sensors on the
+        tool, whose positions get a ``lever``. The same as `of` without bodies or measured
+        orientations.
         """
         points = cls.of(measurements, rows, reference)
         if not bodies or measurements.orientation is None:
@@ -165,7 +166,11 @@ class Rows:
         )
 
     def along_path(self, noise: PathNoise | None) -> Rows:
-        """These rows with errors correlated along the path; the same rows if noise is None."""
+        """Copy with the matrices that decorrelate errors along a path (`decorrelated`).
+
+        ``noise``: correlations of the errors; if it is None, these rows themselves are
+        returned.
+        """
         if noise is None:
             return self
         found = []
@@ -218,9 +223,9 @@ class Rows:
         return self.target if self.place is None else self.place
 
     def whole(self, rows: BoolArray) -> BoolArray:
-        """Mask (n,) extended to both halves (position and orientation) of each reading.
+        """Mask (n,) extended to both halves (position and orientation) of each reading in it.
 
-        The same mask if no orientations are fitted.
+        ``rows``: the mask, which is returned itself if no orientations are fitted.
         """
         if self.turned is None:
             return rows
@@ -235,13 +240,17 @@ class Rows:
         return replace(self.of_groups(0, count), turning=())
 
     def group_sum(self, values: FloatArray) -> FloatArray:
-        """Sum over the rows of each group, (groups, ...), of values (n, ...)."""
+        """Sums over the rows of each group, (groups, ...), of values (n, ...).
+
+        A group is the rows of one sensor at one pose.
+        """
         return _sum(self._rows_of_groups, values)
 
     def blocks(self, rows: int) -> list[tuple[int, int]]:
-        """Runs of groups (first, end), end exclusive, of about ``rows`` rows each.
+        """Split the groups into runs (first, end), end exclusive, of about ``rows`` rows each.
 
-        No group is split, so that a run is longer if a group is.
+        First and end are indices of groups. No group is split, so that a run is longer if a
+        group is.
         """
         number = self.group_start // max(1, rows)
         edges = np.flatnonzero(np.diff(number)) + 1
@@ -249,7 +258,7 @@ class Rows:
         return list(itertools.pairwise(cuts))
 
     def of_groups(self, first: int, last: int) -> Rows:
-        """Rows of the groups from ``first`` to before ``last``."""
+        """Rows of the groups from index ``first`` to before ``last``; itself if these are all."""
         if first == 0 and last == len(self.group_start):
             return self
         start = int(self.group_start[first])

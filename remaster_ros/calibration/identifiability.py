@@ -64,7 +64,7 @@ class GaugeDirection(Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Gauge:
-    """All gauge directions, and their consequences for the joints."""
+    """Parameter combinations that the data do not determine, and the parameters held for them."""
 
     directions: tuple[GaugeDirection, ...]  # One per dimension of the null space
     # Indices of the joints held at zero and of the effects held where they were linearised, (h,)
@@ -127,11 +127,12 @@ def known_offsets(
 ) -> tuple[BoolArray, tuple[str, ...]]:
     """Mask of the identifiable offsets, (k,), and reasons: ``why``, and one for each left out.
 
-    Identifiable are those that the data determine, or a prior within `AS_GOOD_AS_SEEN` times as
-    well (their reason stays); none with a total std above a degree, and none at all if the data
-    determine none. ``chain``: the k joints; ``why``: reason for each joint that the data do
-    not determine, '' for the others; ``by_data, std``: standard deviation by the model, and with
-    known unmodelled errors, rad or m, (k,).
+    Identifiable are offsets that the data determine, or that a prior determines to at most
+    `AS_GOOD_AS_SEEN` times the median standard deviation of these (their reason stays); none
+    with a total std above a degree, and none at all if the data determine none. ``chain``: the
+    k joints; ``why``: reason for each joint that the data do not determine, '' for the others;
+    ``by_data, std``: standard deviation by the model, and with known unmodelled errors, rad or
+    m, (k,).
     """
     by_data = by_data / chain.per_radian
     seen = np.array([not text for text in why])
@@ -187,9 +188,12 @@ def _badly_determined(
 def _null_space(
     model: Model, x: FloatArray, rows: Rows
 ) -> tuple[FloatArray, FloatArray, list[int], list[tuple[FloatArray, int, float]]]:
-    """Scale of each parameter, (size,), basis of the null space, (size, d), and its pivots.
+    """Null space of the data's Jacobian at natural parameters x, (size,).
 
-    Last result: badly determined joints as direction, index and standard deviation, rad or m.
+    Returns the scale of each parameter (root of its information), (size,); a basis of d
+    directions, (size, d), that the data do not determine, or an angle in them to no better than
+    5 degrees; their pivots, the index of the parameter that stands for each; and badly
+    determined joints, each with the direction, (size,), index and standard deviation, rad or m.
     """
     triangle = _triangle(model, x, rows)
     scale = np.linalg.norm(triangle, axis=0)
@@ -221,9 +225,10 @@ def _null_space(
 
 
 def _triangle(model: Model, x: FloatArray, rows: Rows) -> FloatArray:
-    """Factor R of the data's Jacobian J = Q R in units of their spread, at most (size, size).
+    """Triangle R of the decomposition J = Q R of the data's Jacobian, at most (size, size).
 
-    Computed from blocks of rows, so that memory does not grow with their number.
+    Rows of J are divided by the robust spread of their sensor's errors. Computed from blocks of
+    rows, so that memory does not grow with their number. ``x``: natural parameters, (size,).
     """
     errors = rows.target - model.predict(model.pinned(x), rows)
     spread = np.ones(len(model.sensor_names) + len(rows.turning))
@@ -248,12 +253,14 @@ def _nearly_null(
     limit: float,
     factor: float = 0.0,
 ) -> list[tuple[FloatArray, int, float]]:
-    """Directions along which an angle has a standard deviation above a limit, rad.
+    """Directions along which an angle has a standard deviation above a limit, the worst first.
 
-    The zeros of prismatic joints are among the angles, ``per_radian`` of the parameters' units,
-    (size,). The limit is also at least a factor times the median of all angles, and at most
-    `OPEN_ANGLE`. With the pivots of the null space fixed the others have a covariance; its column
-    of the worst angle is the direction. Then that angle is fixed too.
+    Each with the index of the angle and its std, rad or m. ``triangle``: of `_triangle`,
+    divided by ``scale``, (size,), with the effects' prior; ``pivots``: parameters taken as
+    fixed; ``angles``: mask of the parameters that count as angles, zeros of prismatic joints
+    among them, with ``per_radian`` of their units for a radian, (size,); ``limit``: rad, and at
+    least ``factor`` times the median of all angles (that at most `OPEN_ANGLE`). After each
+    direction its angle is taken as fixed, too.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
@@ -293,7 +300,10 @@ def _per_radian(model: Model) -> FloatArray:
 
 
 def _kinds(model: Model) -> tuple[IntArray, ...]:
-    """Indices of effects, joints, markers and registrations: the order of pivots."""
+    """Indices of the parameters by kind, in the order in which kinds are taken as pivots.
+
+    Four arrays: effects; joint offsets; markers and rotations of bodies; registrations.
+    """
     end = model.joints + 6 * len(model.sensor_names)
     return (
         np.arange(model.core, model.size),
@@ -306,10 +316,13 @@ def _kinds(model: Model) -> tuple[IntArray, ...]:
 def _reduce(
     work: FloatArray, scale: FloatArray, kinds: tuple[IntArray, ...]
 ) -> tuple[FloatArray, list[int]]:
-    """Basis (size, d) in reduced echelon form, and its pivots.
+    """Basis (size, d) of a null space in reduced echelon form, and the pivot of each direction.
 
-    The basis comes in units of the scale (size,) and is returned in units of the parameters. Any
-    rotation of the basis spans the same space; in this form each direction has few parameters.
+    A pivot is the index of a parameter that is 1 in its direction and 0 in all others, the
+    largest one of the first of the ``kinds`` that the direction has. ``work``: the basis in
+    units of the ``scale``, (size,), changed in place; the result is in units of the parameters.
+    Any rotation of the basis spans the same space; in this form each direction has few
+    parameters.
     """
     pivots: list[int] = []
     for column in range(work.shape[1]):
@@ -335,11 +348,13 @@ def _reduce(
 def _unresolved(
     by_direction: FloatArray, pivots: list[int], model: Model, scale: FloatArray
 ) -> set[int]:
-    """Pivots that no prior resolves, which are joints or effects and will be fixed.
+    """Pivots of directions that no prior resolves, all of them joints or effects, to be fixed.
 
-    A pivot is unresolved above a certain standard deviation by the priors; for an effect, of any
-    unit, that is a million times the std by the data if it were alone. Raises
-    InsufficientDataError if a registration or marker is among them.
+    A pivot is unresolved if its standard deviation by the priors is above a limit: 5 degrees
+    for an angle (`UNKNOWN_ANGLE`); for an effect, of any unit, a million times the std by the
+    data if it were alone. ``by_direction``: derivative of the priors' whitened residuals along
+    each direction, (m, d). Raises InsufficientDataError if only registrations or markers are
+    unresolved.
     """
     limit = np.where(_angles(model), UNKNOWN_ANGLE * _per_radian(model), 1e3)
     limit[model.core :] = 1e6 / scale[model.core :]
@@ -364,7 +379,10 @@ def _unresolved(
 
 
 def _standard_deviations(by_direction: FloatArray) -> FloatArray:
-    """Standard deviation by priors (m rows) of each of d directions, (d,); inf without any."""
+    """Standard deviation by the priors along each of d directions, (d,); inf without any.
+
+    ``by_direction``: derivative of the priors' m whitened residuals along each, (m, d).
+    """
     norm = np.linalg.norm(by_direction, axis=0)
     has_prior = norm > 0.0
     unit = by_direction[:, has_prior] / norm[has_prior]

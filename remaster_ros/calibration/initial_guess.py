@@ -70,9 +70,11 @@ def robust_start(
 def given_start(
     model: Model, measurements: Measurements, rows: IntArray, start: Start
 ) -> tuple[Model, FloatArray]:
-    """Model with its reference registrations at a known solution, and pinned z there, (size,).
+    """Model with a known solution's registrations as reference, and parameters there, (size,).
 
-    ``rows``: indices of the measurements to fit, about whose median the corrections turn.
+    The parameters are the pinned coordinates (`Model.pinned`) of the solution's zero-offsets
+    and markers. Corrections of a sensor's registration turn about the median of the sensor's
+    positions in ``rows``, the indices of the measurements to fit.
     """
     moved = referenced(model, measurements, rows, start.T_R_N)
     return moved, moved.pinned(moved.vector(start.joint_offsets, start.markers))
@@ -161,10 +163,10 @@ def with_bodies(
 
 
 def _median_rotation(turns: Rotation) -> tuple[FloatArray, float]:
-    """Median of rotations, (3, 3), and the median of their angles from it, rad.
+    """Median of n rotations, (3, 3), and the median of their angles from it, rad.
 
-    The mean weighted by the inverse angles, iterated (Weiszfeld 1937, on rotations Hartley, Aftab
-    and Trumpf 2011, doi:10.1109/CVPR.2011.5995745), is insensitive to some gross errors.
+    The mean weighted by the inverse angles, iterated (Weiszfeld 1937, on rotations Hartley,
+    Aftab and Trumpf 2011, doi:10.1109/CVPR.2011.5995745), is insensitive to some gross errors.
     """
     weight = np.ones(len(turns))
     for _ in range(30):
@@ -304,11 +306,12 @@ def _linear_markers(
 def _refined(
     model: Model, rows: Rows, priors: Sequence[Prior], z: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Minimise the Cauchy cost by damped Gauss–Newton; return the solution and its cost.
+    """Minimise a Cauchy cost by damped Gauss–Newton steps from z; return solution and cost.
 
-    The cost is the sum over the rows of the log of their sensor's robust spread.
-    The outer joints stay at 0, as in pinned coordinates the data do not depend on them. The
-    extension stays at its point of linearisation.
+    The returned cost is the sum over the rows of the log of their sensor's robust spread. The
+    outer two joints stay at 0, as in pinned coordinates the data do not depend on them. The
+    extension's parameters stay as they are. ``z``: pinned parameters, (size,), not changed in
+    place.
     """
     free = np.setdiff1d(np.arange(model.core), (0, model.joints - 1))
     least_damping = 1e-6

@@ -40,7 +40,7 @@ DIFFERENCE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Mode:
-    """Peak of the linearised posterior, and its width."""
+    """Peak of a posterior: parameters and noise, with the linearised posterior about it."""
 
     z: FloatArray  # Pinned parameters, (size,)
     eta: FloatArray  # Coordinates of the noise, (e,)
@@ -162,11 +162,12 @@ def find_mode(posterior: Posterior, begun: Mode | None = None) -> Mode:
 
 
 def noise_mode(posterior: Posterior) -> Mode:
-    """Mode of the noise at the reference, a mode of the parameters with another noise.
+    """Mode of the noise alone, the parameters being kept at the posterior's reference.
 
-    The parameters are integrated out by their tangent there: its log evidence is that of
-    `find_mode` to first order, with one linearisation in place of several. Raises
-    InsufficientDataError as `find_mode`.
+    For a reference that is the mode of the parameters under another noise model. The parameters
+    are integrated out by their tangent there: the log evidence is that of `find_mode` to first
+    order, with one linearisation in place of several. Raises InsufficientDataError if the
+    observations do not determine the noise.
     """
     linearisation = linearise(posterior, posterior.reference)
     try:
@@ -181,8 +182,9 @@ def _uphill(
 ) -> FloatArray:
     """Free parameters after a step, or after the best of shorter ones, at a higher density.
 
-    Given the noise each Gauss–Newton step points uphill. A shorter one may follow the bend of the
-    predictions (Transtrum & Sethna 2012, arXiv:1201.5885).
+    The shortest step if none raises the density. Given the noise each Gauss–Newton step points
+    uphill. A shorter one may follow the bend of the predictions (Transtrum & Sethna 2012,
+    arXiv:1201.5885). ``free``, ``step``: (f,); ``eta``: noise coordinates, (e,).
     """
     posterior = linearisation.posterior
 
@@ -223,9 +225,10 @@ def _bend(linearisation: Linearisation, step: FloatArray, eta: FloatArray) -> Fl
 
 
 def _open_direction(linearisation: Linearisation, eta: FloatArray, step: FloatArray) -> FloatArray:
-    """Loadings (f,) of the worst determined direction along which a step (f,) goes.
+    """Eigenvector (f,) of the information matrix along which a step (f,) goes furthest.
 
-    In units of the effect of each parameter by itself on the observations.
+    Each parameter is in units of its effect by itself on the observations. If parameters have
+    no information at all: 1 for these, 0 for the others.
     """
     f = len(step)
     gram = linearisation.gram(eta)[:f, :f]
@@ -270,9 +273,12 @@ def _noise_guess(posterior: Posterior) -> FloatArray:
 
 
 def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float) -> FloatArray:
-    """Peak of the noise's log density by Newton steps no longer than 1.
+    """Noise coordinates (e,) at the peak of their log posterior density, by Newton steps.
 
-    They end below the shortest length that counts.
+    The parameters are integrated out by the linearisation. From ``start``, (e,); no step is
+    longer than 1. The search ends with a step shorter than ``shortest``, with one that does not
+    raise the density, even shortened, or after 100. Ratios of common parts are 0 or more.
+    Raises numpy.linalg.LinAlgError if a parameter has no information.
     """
     count = len(linearisation.posterior.noise_model.channels)
     peak = np.concatenate((start[:count], np.maximum(start[count:], OFF_ZERO)))
@@ -296,10 +302,10 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 
 
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
-    """Covariance of the noise's coordinates, (e, e), by the curvature at the peak.
+    """Covariance of the noise's coordinates, (e, e), by the curvature at their peak, (e,).
 
-    A shared part within two standard deviations of zero has the mean square of its deviations by
-    quadrature instead, and no correlations.
+    A common part (of pose or frame) whose coordinate is within two standard deviations of zero
+    has the mean square of its deviations by quadrature instead, and no correlations.
     """
     precision = _noise_curvature(linearisation, peak)
     count = len(linearisation.posterior.noise_model.channels)

@@ -66,7 +66,10 @@ class Contrasts:
         return cls(measurements.pose[rows.source], kind, formed[..., :-1], formed[..., -1])
 
     def gram(self, kind: int) -> FloatArray:
-        """Gram matrix of [derivative | error] of the contrasts of one ``kind``, (f + 1, f + 1)."""
+        """Gram matrix of [derivative | error] of the contrasts of one kind, (f + 1, f + 1).
+
+        ``kind``: twice the sensor's index, and one more for means of poses.
+        """
         of_kind = self.kind == kind
         both = np.concatenate((self.derivative[of_kind], self.errors[of_kind][..., None]), axis=2)
         flat = both.reshape(-1, both.shape[2])
@@ -74,10 +77,11 @@ class Contrasts:
         return gram
 
     def distances(self, kind: int, covariance: FloatArray) -> Iterator[float]:
-        """Yield the squared distance per number of each pose of one kind that was not fitted.
+        """Yield the squared error per number of each pose of one kind, as of poses not fitted.
 
-        Mahalanobis distance of its errors over their number, by I + X Σ X'; ``covariance``: Σ of
-        the parameters in units of the noise, (f, f).
+        It is e' (I + X Σ X')⁻¹ e over the number of errors e (squared Mahalanobis distance),
+        with their derivative X. ``kind``: twice the sensor's index, and one more for means of
+        poses; ``covariance``: Σ of the parameters in units of the noise, (f, f).
         """
         for pose in np.unique(self.pose[self.kind == kind]):
             of_pose = (self.kind == kind) & (self.pose == pose)
@@ -153,10 +157,11 @@ def _share_of_orders(n: int, m: int, larger: int) -> float:
 
 
 def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, FloatArray]:
-    """Squared distances per number of poses left out in turn, by kind, (poses of the kind,) each.
+    """Squared Mahalanobis distance per number of each fitted pose, left out in turn, by kind.
 
-    In units of the noise without the pose. At most 1,000 poses, evenly spread; poses that alone
-    determine a direction are skipped. ``covariance``: of the parameters, (f, f).
+    Kind of contrasts -> (poses with the kind,). In units of the noise without the pose. At most
+    1,000 poses, evenly spread; poses that alone determine a direction are skipped.
+    ``covariance``: of the parameters, (f, f).
     """
     kinds = np.unique(fitted.kind).tolist()
     f = len(covariance)
@@ -192,11 +197,12 @@ def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, F
 
 
 def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
-    """Variance of the noise: sum of squares over degrees of freedom.
+    """Variance of the noise: sum of squared errors over the degrees of freedom, at least 1.
 
-    ``gram``: Gram matrix of [columns | errors] of ``size`` numbers, (f + 1, f + 1);
-    ``covariance``: of the fitted parameters in units of the noise, (f, f), whose share of the
-    degrees of freedom is subtracted.
+    The errors are those at the fit, as they are. The degrees of freedom are ``size``, the
+    number of errors, less the trace of the columns' Gram matrix times ``covariance``. ``gram``:
+    Gram matrix of [columns | errors], (f + 1, f + 1); ``covariance``: of the fitted parameters
+    in units of the noise, (f, f).
     """
     freedom = size - np.sum(gram[:-1, :-1] * covariance)
     return float(gram[-1, -1] / max(freedom, 1.0))

@@ -54,13 +54,11 @@ class Linearisation:
         return np.tensordot(1.0 / self.posterior.variances(eta), self.grams, axes=1) + self.prior
 
     def conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gaussian of the f free parameters given the noise.
+        """Gaussian of the f free parameters given the noise, and marginal density of the noise.
 
-        Last result: the marginal density of the noise.
-
-        ``eta``: noise coordinates, (..., e). Returns the mean of the free pinned parameters (...,
-        f), the lower Cholesky factor of their precision (..., f, f), and the log density of the
-        noise coordinates with the parameters integrated out (...).
+        ``eta``: noise coordinates, (..., e). Returns the mean of the free pinned parameters
+        (..., f), the lower Cholesky factor of their precision (..., f, f), and the log density
+        of the noise coordinates with the parameters integrated out (...). Raises as `whitened`.
         """
         factor, pull, log_marginal = self.whitened(eta)
         step = np.linalg.solve(np.swapaxes(factor, -1, -2), pull[..., None])[..., 0]
@@ -69,10 +67,10 @@ class Linearisation:
     def whitened(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Factor L of the precision (..., f, f), L' (mean - z) (..., f), and log density (...).
 
-        ``eta``: noise coordinates, (..., e). All three follow from one Cholesky factor of the
-        bordered matrix: its last row is the vector, its last entry the root of the weighted sum of
-        squares that remains at the mean. Raises numpy.linalg.LinAlgError if a parameter has no
-        information.
+        ``eta``: noise coordinates, (..., e), whose log density it is, with the parameters
+        integrated out. All three follow from one Cholesky factor of the bordered matrix: its
+        last row is the vector, its last entry the root of the weighted sum of squares that
+        remains at the mean. Raises numpy.linalg.LinAlgError if a parameter has no information.
         """
         posterior = self.posterior
         gram = self.gram(eta)

@@ -21,7 +21,7 @@ Method = Literal['metropolis', 'laplace']
 
 
 class Chains(NamedTuple):
-    """Draws of a sampler."""
+    """Draws of several chains of a sampler, with their acceptance rate and a thinned record."""
 
     draws: FloatArray  # (chains, draws, d)
     acceptance_rate: float  # Share of accepted proposals, over all chains
@@ -92,9 +92,9 @@ def independence_sampler(
 def _states_of_chain(log_weight: FloatArray, log_uniform: FloatArray, current: float) -> list[int]:
     """Index of the proposal at which the chain is after each step, n indices; -1 is the start.
 
-    ``log_weight``: importance weights of the n proposals; ``log_uniform``: logs of uniform draws,
-    (n,); ``current``: log weight of the start. A step is taken if its log uniform is below the
-    difference of the weights.
+    ``log_weight``: log importance weights of the n proposals; ``log_uniform``: logs of uniform
+    draws, (n,); ``current``: log weight of the start. A step is taken if its log uniform is
+    below the difference of the log weights, proposal less present state.
     """
     path, state = [], -1
     for step, (weight, limit) in enumerate(zip(log_weight.tolist(), log_uniform.tolist())):

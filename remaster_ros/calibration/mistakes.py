@@ -65,7 +65,7 @@ TRIED = (
 
 @dataclass(frozen=True, eq=False)
 class Mistakes:
-    """Result of the trial of mistakes."""
+    """Fit of a session as it is, and fits with a likely mistake in its tables corrected."""
 
     given: Fitted  # The fit of the session as it is, with unknown marker positions
     # Fits without a mistake, the simplest first; several if the data cannot tell them apart
@@ -218,10 +218,11 @@ def _pairs(m: Measurements) -> list[tuple[int, int]]:
 
 
 def _mistakes_from_row(session: Session) -> Iterator[Arrangement]:
-    """Arrangements with a mistake that begins or ends at a row, each with the row that fits best.
+    """Yield arrangements with a mistake from a row on, or up to one, at the row that fits best.
 
-    One half of the rows has no such change. The first half as given, and the last half with the
-    change, are fitted; every row is compared with both fits.
+    Labels of two markers exchanged from or until a row, and points shifted by one row from a
+    row on. One half of the rows has no such change: the first half as given, and the last half
+    with the change, are fitted; every row is compared with both fits.
     """
     m = session.measurements
     plain, everywhere = Arrangement.given(m.q.shape[1]), np.ones(len(m), bool)

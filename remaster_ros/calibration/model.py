@@ -65,7 +65,7 @@ REGISTRATION_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Layout of the parameters, and the prediction with its derivative."""
+    """Model of the observations: layout of its parameters, prediction and derivative."""
 
     chain: SerialChain  # The nominal robot, k joints
     # Names in the order of the indices in `Measurements`
@@ -284,11 +284,12 @@ class Model:
         return last[:3, 3], last[:3, :3] @ self.chain.axes[-1]
 
     def predict(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Predicted markers in the references' base coordinates, m, (..., n, 3).
+        """Predicted observations in base R by the reference registrations, (..., n, 3).
 
-        For rows of orientations it is the rotation vector from the measured one, rad; errors are
-        ``rows.target`` less the prediction. ``z``: pinned parameters, (..., size); ``rows``: n
-        observations, those of one sensor consecutive.
+        Of a position, m: the marker, or, of a sensor on the tool, the origin of its target. Of
+        an orientation: the rotation vector from the measured to the modelled one, rad. Errors
+        are ``rows.target`` less the prediction. ``z``: pinned parameters (see the module),
+        (..., size); ``rows``: n rows, those of one sensor consecutive.
         """
         turns, shifts = self._extended(z, rows)
         count, offsets = rows.points, self._inner_offsets(z)
@@ -311,17 +312,18 @@ class Model:
         return np.concatenate((points, self._turns(z, offsets, rows, corrections)), axis=-2)
 
     def seen(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Predicted positions as the sensors see them, m, (..., n, 3), without orientations.
+        """Predicted positions as the sensors see them, in R by the references, m, (..., n, 3).
 
-        For a sensor on the tool: the measured position plus the error of `predict`. The sensor's
-        own position by its readings has the noise of the orientation multiplied by the distance,
-        which is no error of the arm.
+        For a sensor on the tool: the measured position less the error, ``rows.target`` less
+        `predict`. The sensor's own position by its readings has the noise of the orientation
+        multiplied by the distance, which is no error of the arm. ``z``: pinned parameters,
+        (..., size); ``rows``: n rows, of positions only.
         """
         predicted = self.predict(z, rows)
         return predicted if rows.lever is None else predicted + (rows.measured - rows.target)
 
     def _places(self, z: FloatArray, rows: Rows) -> FloatArray:
-        """Positions of the rows' points on the tool, in T, m, (..., n, 3).
+        """Points on the tool whose positions the rows measure, in the tool frame, m, (..., n, 3).
 
         The marker, and for a sensor on the tool the point that it measured.
         """
@@ -400,15 +402,19 @@ class Model:
         return Pose(tool, points + shifts, self.chain.axes_in_base(frames), by_joints)
 
     def _inner_offsets(self, z: FloatArray) -> FloatArray:
-        """Joint offsets, rad or m, (..., k), with those of joints 1 and k set to 0."""
+        """Joint offsets of z, a copy with those of joints 1 and k set to 0, (..., k).
+
+        In rad or m; ``z``: pinned parameters, (..., size).
+        """
         offsets = self.offsets(z).copy()
         offsets[..., [0, self.joints - 1]] = 0.0
         return offsets
 
     def _extended(self, x: FloatArray, rows: Rows) -> tuple[dict[int, FloatArray], FloatArray]:
-        """Angles of joints, index -> rad, (..., n), and displacements, m, (..., n, 3), by effects.
+        """Motion by the extension at parameters x (..., size): added joint angles, displacements.
 
-        {} and zeros (3,) without an extension.
+        Angles: joint index -> rad (m for a slide), (..., n); displacements in R, m, (..., n,
+        3). {} and zeros (3,) without an extension.
         """
         if self.extension is None:
             return {}, np.zeros(3)
@@ -416,7 +422,10 @@ class Model:
         return given.turns(theta, rows.source), given.shifts(theta, rows.source)
 
     def _derivative(self, offsets: FloatArray, x: FloatArray, rows: Rows) -> FloatArray:
-        """Derivative of `predict` by all parameters at given offsets (…, k), (n, 3, size)."""
+        """Derivative of `predict` by all parameters at given offsets (k,), (n, 3, size).
+
+        ``x``: all other parameters, (size,).
+        """
         derivative = np.zeros((len(rows.q), 3, self.size))
         tool, points, axes, by_joints = self._pose(offsets, x, rows)
         base, turned = self._transform_of_first_joint(offsets[0])[:3, :3], by_joints
@@ -480,7 +489,7 @@ class Model:
 
 
 class Pose(NamedTuple):
-    """Pose of an arm in n rows, in its base R."""
+    """Tool poses, points, joint axes and the points' Jacobian in n rows, in the base R."""
 
     tool: FloatArray  # T_R_T, (n, 4, 4)
     points: FloatArray  # Markers, displaced by an extension, m, (n, 3)

@@ -50,7 +50,10 @@ class MotionProof(Struct, frozen=True):
 def motion_proof(
     m: Measurements, errors: FloatArray, speeds: FloatArray, friction: FloatArray
 ) -> MotionProof | None:
-    """Return the proof of a fit; None without motion or with too few poses at standstill.
+    """Compare held-out errors at standstill with those in motion; None if it cannot be done.
+
+    None without velocities, or with fewer than 3 held-out poses at standstill, or held-out
+    segments in motion (`FEWEST_POSES`).
 
     Parameters
     ----------
@@ -89,7 +92,10 @@ def motion_proof(
 
 
 def _of_frames(m: Measurements, errors: FloatArray, rows: IntArray) -> FloatArray:
-    """Mean errors of the markers of each frame, m, (frames, 3); ``rows``: indices."""
+    """Mean error of the markers in each frame of rows (indices), m, (frames, 3).
+
+    A frame is one sensor at one configuration. ``errors``: of all rows of ``m``, m, (n, 3).
+    """
     frame = np.stack((m.sensor[rows], m.configuration[rows]))
     of = np.unique(frame, axis=1, return_inverse=True)[1].reshape(-1)
     total = np.zeros((of.max() + 1, 3))

@@ -98,9 +98,10 @@ def _standardised(values: FloatArray) -> FloatArray:
 
 
 def _drifts(time: FloatArray) -> Iterator[FloatArray]:
-    """Yield the columns (n, p) of each drift over times (n,), without the constant.
+    """Yield the columns (n, p) of each drift over times (n,), s, without the constant.
 
-    Polynomials of degree 1 to 3, warm-ups with three time constants, and bends at nine moments.
+    Polynomials of degree 1 to 3, warm-ups with three time constants, and drifts that begin or
+    end at one of nine times.
     """
     share = (time - time.min()) / np.ptp(time)
     polynomials = _polynomials(time)
@@ -114,10 +115,10 @@ def _drifts(time: FloatArray) -> Iterator[FloatArray]:
 
 
 def _places(time: FloatArray, place: FloatArray) -> Iterator[FloatArray]:
-    """Yield the columns (n, p) of each field over positions (n, 3), constant or growing with time.
+    """Yield the columns (n, p) of each polynomial of positions, alone and growing with time.
 
-    First and second degree; fields with as many columns as half of the n means or more are left
-    out.
+    First and second degree, of ``place`` (n, 3), standardised, and ``time`` (n,); those with
+    half as many columns as n or more are left out.
     """
     first, second = np.triu_indices(3)
     fields = place, np.concatenate((place, place[:, first] * place[:, second]), axis=1)

@@ -58,7 +58,10 @@ WHITENED_ROWS = 64
 
 @dataclass(frozen=True, eq=False)
 class Noise:
-    """Standard deviations per axis of the noise of each channel, m, (..., channels)."""
+    """Standard deviations per axis of the noise of each channel, m, (..., channels).
+
+    In rad for channels of orientations.
+    """
 
     sigma: FloatArray  # Part that is independent between rows
     # Part common to the rows of one sensor at one pose; 0 if the channel has none
@@ -75,7 +78,7 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class NoiseModel:
-    """Variances of the errors of some rows."""
+    """Noise of n rows: channels of the sensors, and groups of errors with one variance each."""
 
     rows: Rows  # n rows, sorted by sensor and pose
     sensors: int  # Number of sensors, those without rows included
@@ -182,9 +185,11 @@ class NoiseModel:
         return [*self.separable, *self.framed]
 
     def noise(self, sigma: FloatArray, shared: FloatArray) -> Noise:
-        """Noise with sigma of the channels, m, (..., channels), and the common parts, m, (..., s).
+        """Noise with standard deviations ``sigma`` of channels, ``shared`` of common parts.
 
-        ``shared``: in the order of `shares`; channels without a common part have 0.
+        In m, of channels of orientations rad; (..., channels) and (..., s). ``shared``: in the
+        order of `shares`, pose_sigma first, then frame_sigma; a channel without a common part
+        has 0.
         """
         pose_sigma, frame_sigma = np.zeros_like(sigma), np.zeros_like(sigma)
         count = len(self.separable)
@@ -288,11 +293,11 @@ class NoiseModel:
     def _parts(
         self, rows: Rows, values: FloatArray, first: int
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Vectors of each error group, whose squares its sum consists of.
+        """Yield (error group, vectors whose squares add up to its sum of squares).
 
         For 'frames' these are the frames' means, which contain the poses' means (`contained`).
-        ``rows``: whole groups from the index ``first`` on; ``values``: vectors in the axes of the
-        channels, (n, 3, ...).
+        ``rows``: whole groups of rows from the group with index ``first`` on; ``values``:
+        vectors in the axes of the channels, (n, 3, ...).
         """
         shape = (-1, *(1,) * (values.ndim - 1))
         means = frames = values

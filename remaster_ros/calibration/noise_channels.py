@@ -48,7 +48,7 @@ class ErrorGroup:
 
 
 def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
-    """Error groups of each channel, by frame sizes; only groups with independent errors.
+    """Error groups of each channel, by frame sizes; none without independent errors.
 
     In the order of the channels, each 'rows', then 'frames' and 'poses' by ascending size.
     """

@@ -114,10 +114,10 @@ class NoiseCheck(Struct, frozen=True):
 
     @property
     def noise_std_m(self) -> float | None:
-        """Reliable noise per axis, m; None if neither figure is known.
+        """Reliable standard deviation of the noise per axis, m; None if it is unknown.
 
         The larger of the stated one and that within poses, of which at most 5 times (`SCATTER`)
-        the stated one counts.
+        the stated one counts; the known one if only one of these is known.
         """
         if self.stated_std_m is None or self.within_pose_std_m is None:
             return self.stated_std_m if self.within_pose_std_m is None else self.within_pose_std_m
@@ -125,10 +125,10 @@ class NoiseCheck(Struct, frozen=True):
 
     @property
     def is_of_no_instrument(self) -> bool:
-        """Whether the error is that of no instrument, and the sensor's samples show none as large.
+        """Whether the error is larger than any instrument's, and the samples show no such noise.
 
-        Above 5 mm per axis (`UNCALIBRATED_ERROR_M`) as a mean length, times ``spread`` and a
-        factor for few poses.
+        Larger: above 5 mm per axis (`UNCALIBRATED_ERROR_M`) as a mean length, times ``spread``
+        and a factor for few poses.
         """
         most = MEAN_LENGTH * self.spread * self._few * UNCALIBRATED_ERROR_M
         shown = self.stated_std_m is not None and self.stated_std_m >= UNCALIBRATED_ERROR_M

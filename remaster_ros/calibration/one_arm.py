@@ -51,7 +51,7 @@ class OffsetDifferences:
 
     @property
     def mostly(self) -> bool:
-        """Whether they differ, half of the offsets or more by over 3 standard deviations."""
+        """Whether the offsets `differ`, half of them or more by over 3 standard deviations."""
         return self.differ and bool(
             2 * np.sum(np.abs(self.sigmas) > DIFFERENT_SIGMAS) >= len(self.sigmas)
         )

@@ -155,11 +155,11 @@ def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
 
 
 def as_of_known_size(sigmas: FloatArray, freedom: int) -> FloatArray:
-    """Lengths, in known standard deviations, as rare as the given ones in estimated ones, (n,).
+    """Lengths of errors in known standard deviations, as rare as the given ones, (n,).
 
-    The square of a length of three-dimensional errors in estimated standard deviations is three
-    times F-distributed, in known ones chi-squared. ``freedom``: degrees of freedom of the
-    estimate, at least one.
+    ``sigmas``: lengths of three-dimensional errors in standard deviations that are estimated,
+    (n,); ``freedom``: degrees of freedom of the estimate, at least one. The square of such a
+    length is three times F-distributed, in known standard deviations chi-squared.
     """
     rarity = fdtrc(3, max(freedom, 1), sigmas**2 / 3.0)
     known: FloatArray = np.sqrt(chdtri(3, np.maximum(rarity, np.finfo(float).tiny)))

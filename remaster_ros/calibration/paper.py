@@ -41,10 +41,10 @@ FLATTEST_TRIANGLE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class PaperPosterior:
-    """Equation 15 for one or more sensors and several chains.
+    """Posterior of the paper (equation 15), for one or more sensors and several chains.
 
-    A state is, per sensor, x, y, z in mm and alpha, beta, gamma in degrees (Theta_1); the offsets
-    of all joints in degrees (Theta_2); and sigma per sensor in mm.
+    A state is, per sensor, x, y, z in mm and alpha, beta, gamma in degrees (Theta_1); the
+    offsets of all joints in degrees (Theta_2); and sigma per sensor in mm.
     """
 
     chain: SerialChain  # The nominal robot
@@ -206,9 +206,10 @@ def _paper_natural(
 
 
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
-    """Gauge whose directions state what fixes them in the paper, which has flat priors.
+    """Gauge in which `fixed_by` and `why` say what fixes each direction in the paper's fit.
 
-    A direction of a held joint is fixed by nothing, any other by markers taken as exact.
+    Directions are those of the null space. One that a joint held at zero fixes (``gauge.held``)
+    is fixed by nothing there, as priors are flat; any other by markers taken as exact.
     """
     held_joints = {f'{model.names[index]} = 0' for index in gauge.held}
     directions, why = [], list(gauge.why)

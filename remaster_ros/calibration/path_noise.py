@@ -50,7 +50,7 @@ MOST_SEARCHED = 600
 
 @dataclass(frozen=True, eq=False)
 class PathNoise:
-    """Correlations of all rows of a session."""
+    """Correlations of errors along a path, for all sensors and rows of a session."""
 
     # Nominal tool, of every row: position, m, (n, 3), and turn, a matrix, (n, 9)
     position: FloatArray
@@ -71,15 +71,18 @@ class PathNoise:
         return self._correlations(sensor, rows, float(self.share[sensor]), 1.0)
 
     def of_markers(self, sensor: int, rows: IntArray) -> FloatArray:
-        """Correlations of the deviations of one marker in some rows (indices), (r, r).
+        """Correlations of one marker's deviations from the frames' means in r rows, (r, r).
 
-        Deviations are from the frames' means.
+        ``sensor``, ``rows``: indices.
         """
         share, scale = float(self.marker_share[sensor]), float(self.marker_scale[sensor])
         return self._correlations(sensor, rows, share, scale)
 
     def _correlations(self, sensor: int, rows: IntArray, share: float, scale: float) -> FloatArray:
-        """Correlations of a sensor's rows, (n, n), with their lengths times `scale`."""
+        """Correlations of n rows (indices) of a sensor, (n, n), 1 on the diagonal.
+
+        ``share``: of the process in the variance; ``scale``: factor on the sensor's lengths.
+        """
         lengths = float(self.length_m[sensor]), float(self.length_rad[sensor])
         d = _distance(self.position[rows], self.turn[rows], *lengths)
         return _correlations(d / scale, share, int(self.order[sensor]))
@@ -246,9 +249,9 @@ def _minimised(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[
 
 
 def _natural(logs: FloatArray) -> tuple[float, float, float]:
-    """Share of the process and its lengths, m and rad, all clipped to their ranges.
+    """Share of the process and its lengths, m and rad, each clipped to its range.
 
-    From (3,): logit of the share, logs of the lengths over their starts.
+    ``logs``: logit of the share, and logs of the lengths over `START_M` and `START_RAD`, (3,).
     """
     share = float(np.clip(1.0 / (1.0 + np.exp(-logs[0])), *RANGE_SHARE))
     length_m = float(np.clip(START_M * np.exp(logs[1]), *RANGE_M))
@@ -339,9 +342,11 @@ def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
 
 
 def _inverse_factor(correlations: FloatArray) -> FloatArray:
-    """Matrix that decorrelates errors, in proportion to their scatter about their mean.
+    """Matrix (f, f) that decorrelates f errors with correlations (f, f).
 
-    The mean of a slow process over a path is no scatter: a registration absorbs it.
+    The inverse Cholesky factor, times the root of the share of variance that is scatter about
+    the errors' mean: the mean of a slow process over a path is none, as a registration absorbs
+    it.
     """
     factor = np.linalg.cholesky(correlations)
     inverse = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)

@@ -59,7 +59,7 @@ class NoiseMixture:
 
 @dataclass(frozen=True, eq=False)
 class Precision:
-    """Covariance of the f free parameters of a fit, with the figures of offsets and tool."""
+    """Covariance of the f free parameters of a fit, with the errors of offsets and tool."""
 
     # Index of each joint among the free parameters, (k,); -1 if it is not identifiable
     joints: tuple[int, ...]

@@ -78,8 +78,8 @@ def register_ransac(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Registration by the points that agree, without single points that are not of the marker.
 
-    A frame is computed from every three points; the frame with most agreeing points is refined by
-    all of these.
+    A frame is computed from every three of the first 20 points (`TRIED_POINTS`); the frame with
+    most agreeing points is refined by all of these.
 
     Parameters
     ----------

@@ -81,9 +81,11 @@ class StructureTest(Struct, frozen=True):
         return 'p < 0.0001' if self.p_value < 1e-4 else f'p = {self.p_value:.4f}'
 
     def words(self, timed: bool = True) -> str:
-        """What the residuals depend on, as a clause; ``timed``: whether the readings have times.
+        """Clause on what the test shows: 'the error of tracker follows time within the poses'.
 
-        Without times they follow 'the order of the rows'.
+        Of 'held_out': by what factor the error on held-out poses is larger than on poses left
+        out of the fit. ``timed``: whether readings have times; else it says 'the order of the
+        rows' in place of time.
         """
         where = 'from pose to pose' if self.between_poses else 'within the poses'
         of_sensor = f' of {self.sensor}' if self.sensor else ''
@@ -176,9 +178,11 @@ def residual_structure(mode: Mode, measurements: Measurements) -> ResidualStruct
 
 
 def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArray]:
-    """Functions of every driver, of each sensor separately, and of every degree, (n, 3, c).
+    """Columns (n, 3, c) of smooth functions for each driver and degree, by `_family_key`.
 
-    By `_family_key`; ``seconds``: times of the rows, (n,).
+    A driver is a quantity that the errors may depend on: the joints' angles or times, links,
+    axes; and, for each sensor separately, position and time. ``seconds``: times of the rows, s,
+    (n,).
     """
     names = mode.linearisation.posterior.model.sensor_names
     families = {
@@ -201,7 +205,10 @@ def _families(mode: Mode, rows: Rows, seconds: FloatArray) -> dict[str, FloatArr
 
 
 def _family_key(driver: str, sensor: str, degree: int) -> str:
-    """Key of a family in `_families`, '<driver> <degree> <sensor>'; ``sensor`` '' for all."""
+    """Key in `_families` of a driver's functions, '<driver> <degree> <sensor>'.
+
+    ``sensor``: its name, '' for functions of the joints, common to all sensors.
+    """
     return f'{driver} {degree} {sensor}'
 
 
@@ -245,11 +252,12 @@ def _explained(
     basis: FloatArray,
     dependent: int = 0,
 ) -> StructureTest | None:
-    """Test whether the columns of a driver explain the remainder (n, 1) after the model's columns.
+    """Test whether a driver's functions explain the remainder (n, 1) after the model's columns.
 
-    The columns of the highest degree with enough rows; None if there are too few rows for any
-    degree. ``columns``: by `_family_key`; ``basis``: of the model's columns, (n, b);
-    ``dependent``: how many of the n numbers depend on the others: 0 for means of poses.
+    The functions of the highest degree with enough rows; None if there are too few rows for any
+    degree. ``driver``: as of `StructureTest`; ``sensor``: its name, '' for all; ``columns``: by
+    `_family_key`; ``basis``: of the model's columns, (n, b); ``dependent``: how many of the n
+    numbers depend on the others: 0 for means of poses.
     """
     for degree in range(LARGEST[driver], 0, -1):
         found = _f_test(columns[_family_key(driver, sensor, degree)], remainder, basis, dependent)
@@ -259,7 +267,7 @@ def _explained(
 
 
 class Explained(NamedTuple):
-    """Test and share of the means of the poses that a family of functions explains."""
+    """P-value of an F test, and the share of squares that a family of functions explains."""
 
     p_value: float  # Probability of as much by chance
     # Explained share of the sum of squares after the model, in the rows with functions that are

@@ -202,12 +202,19 @@ class FitResult:
 
     @property
     def clocks(self) -> Mapping[str, tuple[float, float]]:
-        """Delay of each sensor's stamps to the joints', and its std, s; {} if none moved."""
+        """Delay of each sensor's stamps against the joints', and its std, s, by name.
+
+        {} if no parameters of motion were fitted (`clocks_of`).
+        """
         return {} if self.found is None else clocks_of(self.found)
 
     @cached_property
     def motion_proof(self) -> MotionProof | None:
-        """Held-out errors at standstill beside those in motion; None if they do not tell."""
+        """Held-out errors at standstill compared with those in motion; computed once.
+
+        None if the session has no velocities, or too few held-out rows of either
+        (`motion_proof`).
+        """
         m = self.session.measurements
         if m.velocity is None:
             return None
@@ -219,7 +226,7 @@ class FitResult:
 
     @property
     def T_R_N_before(self) -> Mapping[str, FloatArray]:
-        """Registrations (4, 4) by sensor of the fit with all offsets held at zero."""
+        """Registrations T_R_N (4, 4), by sensor name, of the fit with all offsets held at zero."""
         return self.comparison.T_R_N_before
 
     @property
@@ -296,7 +303,7 @@ class FitResult:
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """Result of a sampler, for `build_result`."""
+    """Draws of a sampler, with their posterior and gauge, from which a result is built."""
 
     posterior: Posterior  # Sampled posterior of parameters and noise
     # Pinned parameters, (chains, draws, size), and noise coordinates, (chains, draws, e)
@@ -323,9 +330,9 @@ class Sampled:
     found: Estimate | None = None  # Estimate with this posterior; None if it was not computed
 
     def widened(self, rng: np.random.Generator) -> Sampled:
-        """Same draws with random contributions of causes outside the model; unchanged without any.
+        """Copy with random contributions of causes outside the model added to its draws ``z``.
 
-        The mean over all draws stays the same.
+        The mean over all draws stays the same. Itself if no such causes are expected.
         """
         if self.unmodelled is None:
             return self
@@ -338,10 +345,11 @@ class Sampled:
 def sampled_columns(
     posterior: Posterior, x: FloatArray, eta: FloatArray, moved: IntArray
 ) -> FloatArray:
-    """Values of a fit's chains, (..., p): moved parameters of x, every sigma, known common parts.
+    """Sampled quantities of draws, (..., p): parameters, sigmas, and common parts of the noise.
 
-    ``x``: natural parameters, (..., size); ``eta``: noise coordinates, (..., e); ``moved``:
-    indices of the sampled parameters.
+    ``x``: natural parameters, (..., size), of which those in ``moved`` (indices) were sampled;
+    ``eta``: noise coordinates, (..., e). The noise is sigma of every channel, then pose_sigma
+    and frame_sigma of the channels that have them.
     """
     noise = posterior.noise(eta)
     shared = posterior.noise_model.shared(noise)
@@ -349,9 +357,9 @@ def sampled_columns(
 
 
 def _sampled_names(posterior: Posterior, moved: IntArray) -> tuple[str, ...]:
-    """Names of the columns of `sampled_columns`: moved parameters, then sigmas of the noise.
+    """Names of the columns of `sampled_columns`, p strings.
 
-    ``moved``: indices of the moved parameters.
+    ``moved``: indices of the sampled parameters.
     """
     model, noise_model = posterior.model, posterior.noise_model
     noises = [
@@ -533,10 +541,11 @@ def _orientations(
 def _offset_summary(
     draws: FloatArray, radian: FloatArray, taken_as_known: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Mean (k,), std (k,) and 95 % interval (k, 2) of offsets (n, k), rad or m.
+    """Mean (k,), std (k,) and 95 % interval (k, 2) of draws of offsets (n, k), rad or m.
 
-    ``radian``: 0 for identifiable joints, otherwise the offset that counts as a radian, (k,);
-    these joints have mean 0 and the std and interval of a whole turn.
+    ``radian``: 0 for joints that are not held by the gauge, else the offset that counts as a
+    radian, (k,); held joints have mean 0 and the std and interval of a whole turn.
+    ``taken_as_known``: further std of each offset, added in squares, (k,).
     """
     undetermined = radian > 0.0
     mean = draws.mean(axis=0)

@@ -36,10 +36,10 @@ NOISE_RANGE = (-3.0, 3.0)
 
 
 def robust_std(mode: Mode, measurements: Measurements) -> FloatArray:
-    """Standard deviation of each joint's offset with a discrepancy, rad or m, (k,).
+    """Standard deviation of each joint's offset with smooth errors outside the model, (k,).
 
-    0 for offsets that are held; never below that of the model. ``mode``: of the posterior of the
-    fitted rows; ``measurements``: source of the rows.
+    In rad or m; 0 for offsets that are held; never below that of the model. ``mode``: of the
+    posterior of the fitted rows; ``measurements``: source of the rows.
     """
     posterior = mode.linearisation.posterior
     rows = spread_poses(posterior.rows)

@@ -183,8 +183,9 @@ def _adapted(
 ) -> tuple[AdaptedProposal, Weighted]:
     """Best of up to 8 proposals, each adapted to draws of the one before, with its draws.
 
-    Ends once half of the draws are effective (`GOOD_WEIGHTS`). ``evaluations``: of the density,
-    that are allowed.
+    Best by the effective number of draws. Ends once half of the draws are effective
+    (`GOOD_WEIGHTS`). ``evaluations``: number of evaluations of the density that are allowed;
+    ``report``: called with the stage and the share of it that is done.
     """
     count = max(ROUND_DRAWS, ROUND_DRAWS_PER_DIMENSION * proposal.dimension)
     rounds = int(np.clip(evaluations // count, 1, ROUNDS))
@@ -210,12 +211,13 @@ def _long_enough(
     worth: float,
     quantities: Callable[[FloatArray], FloatArray],
 ) -> Chains | None:
-    """Chains, sampled in batches until they have the wanted effective draws.
+    """Chains, sampled in batches until they have enough effective draws; None if they will not.
 
-    None if they will not.
-
-    ``more``: continues from a state, (start, draws, warm-up) to chains; ``worth``: expected
-    effective share of the draws.
+    Enough: ``wanted`` ones of every quantity, in bulk and tails, or 400 (`ESS_LIMIT`) at the
+    largest length; R-hat at most 1.01. ``more``: samples chains, from (start, draws, warm-up);
+    ``start``: first states; ``most``: largest number of draws of a chain; ``worth``: expected
+    effective share of the draws; ``quantities``: of points (..., d) to the quantities (..., p)
+    that decide.
     """
     first = int(np.clip(1.1 * wanted / (worth * len(start)), FEWEST_DRAWS, most))
     run = more(start, first, WARM_UP)

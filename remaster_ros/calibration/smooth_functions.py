@@ -57,9 +57,10 @@ def spread_poses(rows: Rows) -> Rows:
 
 
 def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-    """Families of columns (n, 3, c) in units of the noise at a mode, by name.
+    """Columns (n, 3, c) of families of functions in units of the noise at a mode, by name.
 
-    With 'errors' (n, 3, 1) and 'model', the derivative by the free parameters, (n, 3, f).
+    With 'errors', measured less modelled, (n, 3, 1), and 'model', the derivative by the free
+    parameters, (n, 3, f), in these units, too.
     """
     posterior = mode.linearisation.posterior
     model = posterior.model
@@ -75,9 +76,10 @@ def whitened(mode: Mode, rows: Rows, families: Mapping[str, FloatArray]) -> dict
 
 
 def of_position(rows: Rows, degree: int = POSITION_DEGREE) -> FloatArray:
-    """Polynomials of the measured position up to the first or second degree, without the constant.
+    """Polynomials of the measured position, of degree 1 or up to 2, without the constant.
 
-    (n, 3, 9 sensors) or (n, 3, 27 sensors), as `by_sensor` splits them.
+    Separate for sensors and axes (`by_sensor` splits them): (n, 3, 9 sensors) or (n, 3, 27
+    sensors).
     """
     measured = rows.measured
     place = np.empty_like(measured)
@@ -102,9 +104,10 @@ def of_time(rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE) -> Float
 def of_joint_times(
     mode: Mode, rows: Rows, seconds: FloatArray, degree: int = TIME_DEGREE
 ) -> FloatArray:
-    """Errors by zero-offsets that change with time, s, (n,): (n, 3, degree k).
+    """Displacements by zero-offsets that change with time, (n, 3, degree k), m per rad.
 
-    Blocks of k columns for Legendre polynomials of degree 1 to ``degree``.
+    Blocks of k columns for Legendre polynomials of degree 1 to ``degree`` over the range of
+    times ``seconds``, s, (n,).
     """
     by_joints = mode.linearisation.posterior.model.inner_pose(mode.z, rows).by_joints
     functions = _polynomials(seconds, degree)
@@ -121,11 +124,11 @@ def _polynomials(seconds: FloatArray, degree: int) -> FloatArray:
 
 
 def of_joint_angles(mode: Mode, rows: Rows, harmonics: int = HARMONICS) -> FloatArray:
-    """Errors by each joint's error as harmonics of its own angle, (n, 3, 2 harmonics k).
+    """Displacements by joint errors that are harmonics of their joint's own angle.
 
-    Blocks of k columns: sine and cosine of the angle, then of its double. For a joint that slides
-    half a turn is the measured travel: a sine of its position is then as smooth as one of an
-    angle.
+    (n, 3, 2 harmonics k), in blocks of k columns: sine and cosine of the angle, then of its
+    double. For a joint that slides half a turn is the measured travel: a sine of its position
+    is then as smooth as one of an angle.
     """
     model = mode.linearisation.posterior.model
     by_joints = model.inner_pose(mode.z, rows).by_joints
@@ -163,7 +166,7 @@ def of_links(mode: Mode, rows: Rows) -> tuple[FloatArray, FloatArray]:
 
 
 def by_sensor(rows: Rows, columns: FloatArray) -> dict[int, FloatArray]:
-    """Functions of position or time (n, 3, c sensors) for each sensor, by its index."""
+    """Split functions of position or time (n, 3, c sensors) by sensor: index -> (n, 3, c)."""
     parts = np.split(columns, len(rows.spans), axis=2)
     return {sensor: part for (sensor, _), part in zip(rows.spans, parts, strict=True)}
 

@@ -131,7 +131,10 @@ def warn_of_harm(judged: OffsetsJudgement, path: Path) -> None:
 
 
 def table(judged: OffsetsJudgement) -> str:
-    """Return the metrics as text, one per line, then the observations left out."""
+    """Return the three metrics before and after as text, one per line for each split.
+
+    Then the observations that were left out, each with the reason.
+    """
     lines = [f'{"mean error [95 % interval], mm":{WIDTH + 2}s} {"before":28s} after']
     for split, metrics in judged.accuracy.items():
         if metrics is None:

@@ -41,7 +41,7 @@ _READ = ('.yaml', '.csv', '.urdf', '.xml')
 
 @dataclass(frozen=True)
 class Job:
-    """A session to evaluate; can be sent to another process."""
+    """One session to evaluate in a batch, and where its results go; picklable."""
 
     key: str  # Of its files, this version, the seed and the baseline
     # Its folder, and where its results go
@@ -91,10 +91,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate all sessions without a row yet; then write the page.
+    """Evaluate all sessions without a final row yet; then write the page over all of them.
 
-    Returns 0 if any session has an answer, else 1. Raises InputError: the folder holds other
-    results, or the scheduler cannot be used.
+    Sessions that ended with an error or a killed worker are tried again. Returns 0 if any
+    session has the status 'done', else 1. Raises InputError: the folder holds other results,
+    or the scheduler cannot be used.
     """
     baseline = '' if args.baseline is None else str(args.baseline.resolve())
     folders = list(dict.fromkeys(folder.resolve() for folder in args.session))
@@ -141,7 +142,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """Raise InputError if the folder has results of another command, or a session."""
+    """Raise InputError if the folder has results of another command, or is a session.
+
+    ``folder``: output of the batch; one that has rows of a batch already passes.
+    """
     from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, WRITTEN
     from remaster_ros.session.records.reader import HEADER
 
@@ -156,10 +160,11 @@ def _refuse_foreign(folder: Path) -> None:
 
 
 def _job(folder: Path, out: Path, seed: int, baseline: str) -> Job:
-    """Return the job of a session; an unreadable file becomes the error of its row.
+    """Return the job of a session, whose key is a checksum of version, seed, and its files.
 
-    Its key is a checksum of version, seed, and the files that are read. ``out``: folder of the
-    batch, in which the session gets a folder of its own; ``baseline``: path, '' for none.
+    An unreadable file raises nothing: it will be the error of its row. ``folder``: the
+    session; ``out``: folder of the batch, in which the session gets a folder of its own;
+    ``baseline``: path of a compensation.json, '' for none.
     """
     made_of = hashlib.sha256(f'{__version__} {seed}'.encode())
     files = sorted(
@@ -187,11 +192,11 @@ def _digest(path: Path) -> str:
 
 
 def _said(rows: Journal, path: Path) -> dict[str, dict[str, Any]]:
-    """Return the last row of each key, as recorded earlier.
+    """Return the last row of each key in the journal of an earlier run, key -> row.
 
-    ``path``: of the journal, for the error.
+    ``rows``: the journal; ``path``: its path, for the error.
 
-    Raises InputError, with the line, if the journal is of something else.
+    Raises InputError, with the line, if a record is no row of a batch.
     """
     rows_by_key = {}
     for line, row in enumerate(rows.records, 1):
@@ -222,10 +227,11 @@ def worked(job: Job) -> dict[str, Any]:
 
 
 def _results(job: Job) -> dict[str, Any]:
-    """Return the row of a session; results are written into `job.out`.
+    """Evaluate a session; write the results into `job.out`, and return the row's columns.
 
-    An InsufficientDataError of the search, or an error of the check, becomes the text of its
-    column; errors of reading and fitting are raised.
+    Columns: fit, discovery and, with a baseline, check. An InsufficientDataError of the
+    search, or an error of the check, becomes the text of its column; errors of reading and
+    fitting are raised.
     """
     import numpy as np
 
@@ -258,7 +264,7 @@ def _results(job: Job) -> dict[str, Any]:
 
 
 def _of_fit(path: Path) -> dict[str, Any]:
-    """Robot, judgement, held-out errors, mm, and offsets of a fit.json.
+    """Return robot, judgement, held-out errors, mm, and offsets of a fit.json as plain data.
 
     Raises OSError, ValueError, KeyError or TypeError if it is unreadable or of another form.
     """
@@ -277,9 +283,9 @@ def _of_fit(path: Path) -> dict[str, Any]:
 
 
 def _offset(offset: Mapping[str, Any]) -> dict[str, Any]:
-    """Row of an offset of fit.json, in its unit there (deg, or mm for a prismatic joint).
+    """Return mean and standard deviation of an offset of fit.json as plain data.
 
-    Mean and standard deviation are None if the offset is not identifiable.
+    In its unit there (deg, or mm for a prismatic joint); None if it is not identifiable.
     """
     known, unit = offset['identifiable'], offset.get('unit', 'deg')
     row = {'joint': offset['joint'], 'mean_deg': None, 'std_deg': None}
@@ -310,7 +316,7 @@ def _of_discovery(path: Path) -> dict[str, Any]:
 
 
 def _of_check(job: Job, session: Any) -> dict[str, Any]:
-    """Return the columns of a check against the baseline, as `content_of`.
+    """Return the result of a check of a session against the baseline, as `content_of`.
 
     Raises InputError if the baseline is invalid or of another arm.
     """

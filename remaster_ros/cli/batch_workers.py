@@ -184,7 +184,7 @@ def _require_this_version(client: Any, address: str) -> None:
 
 
 def _version() -> str:
-    """Return the version of this package."""
+    """Return the version of this package; run on each worker of a scheduler."""
     return __version__
 
 

@@ -147,7 +147,11 @@ def _seconds(created: str) -> float:
 
 
 def _record(measured: Measured, name: str, sha256: str, baseline: Compensation) -> dict[str, Any]:
-    """Record of a check for the history: baseline, arm, session, readings, and time if known."""
+    """Return a check as a record for the history.
+
+    It has baseline, arm, session, readings, and the time if known, else None. ``name``: of the
+    session; ``sha256``: of its observations.
+    """
     return {
         'format': HISTORY,
         'baseline_sha256': baseline.sha256,
@@ -164,9 +168,10 @@ def _record(measured: Measured, name: str, sha256: str, baseline: Compensation) 
 
 
 def _require_history(path: Path) -> None:
-    """Raise InputError for a file that is no history, before it is opened as a journal.
+    """Raise InputError if a file exists and does not begin as a history of checks.
 
-    Opening drops what is no whole line. No file, and an empty or torn one, pass.
+    To be called before it is opened as a journal, which drops what is no whole line. An empty
+    file passes, and one whose first line is cut off.
     """
     start = format_record({'format': HISTORY})[: len(f'{{"format":"{HISTORY}"')]
     try:
@@ -188,11 +193,12 @@ def _require_history(path: Path) -> None:
 def _before(
     history: Journal, path: Path, baseline: Compensation
 ) -> tuple[list[Measured], list[str]]:
-    """Return the checks of a history and their names, oldest first.
+    """Return the checks in a history and the names of their sessions, oldest first.
 
     ``path``: of the history, for the errors.
 
-    Raises InputError for a record of another arm or baseline, or a damaged record.
+    Raises InputError, with the line, for a record of another arm or baseline, or a damaged
+    one.
     """
     checks, names = [], []
     for line, record in enumerate(history.records, 1):
@@ -290,9 +296,9 @@ def content_of(
 
 
 def _trend(found: CheckResult, joint_names: tuple[str, ...], names: list[str]) -> dict[str, Any]:
-    """Trend of the checks for JSON: kind, joints by name, size and half width, mm, and since when.
+    """Return the trend of the checks for JSON: kind, joints by name, size, and since when.
 
-    `found.trend` may not be None.
+    Size and half width of its 95 % interval are in mm. `found.trend` may not be None.
     """
     trend = found.trend
     assert trend is not None
@@ -344,9 +350,10 @@ def _span(found: CheckResult, trend: Trend) -> str:
 def _trend_in_words(
     found: CheckResult, joint_names: tuple[str, ...], names: list[str], smallest_mm: float
 ) -> str:
-    """Return a change that is certain and no alarm, and when to look again, in sentences.
+    """Return sentences on the trend (a change that is certain, without an alarm) and what to do.
 
-    `found.trend` may not be None; ``names``: of the checks; ``smallest_mm``: change that matters.
+    `found.trend` may not be None; ``names``: of the sessions of all checks; ``smallest_mm``:
+    change at the tool that matters.
     """
     trend = found.trend
     assert trend is not None
@@ -381,8 +388,8 @@ def in_words(
 ) -> str:
     """Return sentences on the verdict and on the next step.
 
-    ``names``: of the checks, oldest first; ``smallest_mm``: change at the tool that matters.
-    ``joint_names``: in the chain's order.
+    ``joint_names``: in the chain's order; ``names``: of the sessions of all checks, oldest
+    first; ``smallest_mm``: change at the tool that matters.
     """
     if found.trend is not None:
         return _trend_in_words(found, joint_names, names, smallest_mm)
@@ -445,13 +452,19 @@ def in_words(
 
 
 def _named(found: CheckResult, names: list[str]) -> str:
-    """Check from which on it has changed, as text: number, from 1, and name."""
+    """Return the check since which the arm has changed: '3 (NAME)', number from 1 and session.
+
+    The first check if that is not known (`found.since` None).
+    """
     since = found.since or 0
     return f'{since + 1} ({names[since]})'
 
 
 def _text(content: dict[str, Any]) -> str:
-    """Text of a check's result for people, from its JSON: verdict, a line per joint, evidence."""
+    """Return what ``remaster check`` prints: verdict, a line per joint, evidence and noise.
+
+    ``content``: as returned by `content_of`.
+    """
     drifts = content['trend'] is not None and content['trend']['kind'] == 'drift'
     # The sentence of a drift begins with the word.
     lines = [content['text'] if drifts else f'{content["verdict"]}: {content["text"]}']

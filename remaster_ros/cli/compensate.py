@@ -123,9 +123,10 @@ def _shown(chain: SerialChain, joint: int, value: float, digits: int = 2) -> str
 
 
 def _temperature(table: TextTable, columns: Columns, stated: float | None) -> FloatArray | None:
-    """Return the temperature of each row, °C, (n,); None if unknown.
+    """Return the temperature of each row, °C, (n,); None if it is not known.
 
-    ``stated``: of the command line, which has precedence over the table's column.
+    ``stated``: that of the command line, for all rows, which has precedence over the table's
+    column; None for none. Raises InputError if a cell of the column has no number.
     """
     column = columns.first_of_kind('temperature')
     if stated is not None:
@@ -144,7 +145,9 @@ def _refuse_beyond(
 ) -> None:
     """Raise InputError for implausible changes, and commands beyond the joints' limits.
 
-    Implausible is more than --max-change-deg. The first such row is named, with its line.
+    A change of more than --max-change-deg is implausible. The first such row is named, with
+    its line. ``given, result``: joint positions before and after, rad or m, (n, k); ``done``:
+    the correction with its commands.
     """
     chain, joints = compensator.model.chain, compensator.joint_names
     change, most = np.abs(result - given), np.radians(args.max_change_deg) * chain.per_radian
@@ -166,10 +169,10 @@ def _refuse_beyond(
 
 
 def _text(table: TextTable, columns: Columns, joints: FloatArray, digits: Sequence[int]) -> str:
-    """Return the table with other joint positions, everything else unchanged.
+    """Return the table as CSV text with other joint positions, everything else unchanged.
 
-    ``joints``: (n, k), in the units of the table; ``digits``: decimals of each. A separator that
-    is not one character becomes a comma.
+    ``joints``: (n, k), in the units of the table; ``digits``: decimals of each joint. A
+    separator of several characters becomes a comma.
     """
     separator = table.separator if len(table.separator) == 1 else ','
     text = io.StringIO()
@@ -192,10 +195,12 @@ def _facts(
     done: Correction,
     times_s: FloatArray | None,
 ) -> dict[str, Any]:
-    """Return the summary as plain data: changes, added speed, rows, residuals, in deg, mm and %.
+    """Return the summary of a correction as plain data for --json.
 
-    ``wanted``: configurations at which the expected error is computed. Rows count from 1, without
-    the header; the added speed is None without increasing times.
+    Largest changes (deg, mm), added speed (%), residuals and expected error (mm), and numbers
+    of rows, from 1 without the header. ``given, result``: joint positions before and after,
+    (n, k); ``wanted``: those at which the expected error is computed; ``times_s``: of the
+    rows; the added speed is None without increasing times.
     """
     chain, joints = compensator.model.chain, compensator.joint_names
     shown = chain.shown_scale * np.abs(result - given).max(axis=0, initial=0.0)
@@ -227,7 +232,10 @@ def _facts(
 
 
 def _summary(facts: dict[str, Any], out: Path) -> str:
-    """Return the summary of `_facts` as text, with the largest change in each unit."""
+    """Return the summary in `facts` as text, with the largest change in each unit.
+
+    ``facts``: as returned by `_facts`; ``out``: path of the written table.
+    """
     residual, most = facts['residual_mm'], []
     for unit in ('deg', 'mm'):
         if of_joints := facts.get(f'change_{unit}'):

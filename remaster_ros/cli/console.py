@@ -17,11 +17,11 @@ LEAST_S = 1.0
 
 @contextmanager
 def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """Yield a function (stage, share done) that shows a bar if stderr is a terminal.
+    """Context: yield a function (stage, share done) that shows a progress bar on stderr.
 
     The bar shows the stage, its share done and the remaining time; it moves to and fro if the
-    share is unknown. Without a terminal, or if ``quiet``, the function does nothing. Shares are
-    from 0, unknown, to 1.
+    share is 0 (unknown). The share is at most 1. Without a terminal, or if ``quiet``, the
+    function does nothing.
     """
     if quiet or not sys.stderr.isatty():
         yield lambda stage, share: None

@@ -120,11 +120,11 @@ def run(args: argparse.Namespace) -> NoReturn:
 
 
 def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
-    """Return the parameters of the collection: cell and number of candidates.
+    """Return the parameters of the demo's collection: cell and numbers of candidates.
 
-    ``candidates``: as given, None for none; ``hidden``: whether causes are looked for. An optimal
-    design for the offsets keeps the fewest poses that a search for causes needs; a demo that looks
-    for causes has more of them.
+    ``candidates``: as given, None for none; ``hidden``: whether causes are looked for. With
+    neither it is the cell with an optimal design, which keeps the fewest poses that a search
+    for causes needs; a demo that looks for causes visits more of them.
     """
     if candidates is None and not hidden:
         return {

@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _motor(text: str) -> tuple[str, MotorNumber]:
     """Argument type: a joint and the numbers of its motor, JOINT=OLD,COUNTS,DIRECTION.
 
-    Raises ArgumentTypeError for another form, counts not above 0, or a direction other than 1 and
-    -1.
+    They are the number stored in the controller, counts per degree, and 1 or -1. Raises
+    ArgumentTypeError for another form, counts not above 0, or another direction.
     """
     name, _, values = text.partition('=')
     parts = values.split(',')
@@ -110,10 +110,10 @@ def _frame(text: str) -> tuple[str, str]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write a correction in a form, and print its difference to the whole correction; return 0.
+    """Write a correction in a form, and print what that form leaves out; return 0.
 
-    Raises InputError for options that the form does not have, unknown joints, an invalid file, and
-    a folder that is not new.
+    Raises InputError for options that the form does not have, unknown joints, an invalid file,
+    and a folder that is not new.
     """
     for given, forms, option in (
         (args.base, ('ur', 'ros2_control', 'rising'), '--base'),

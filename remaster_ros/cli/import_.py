@@ -150,10 +150,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mend(args: argparse.Namespace) -> int:
-    """Write a session with its mistake corrected, as the options say; return 0.
+    """Write a copy of a session with a mistake corrected, as the options say; return 0.
 
     Raises InputError for options that do not go with a session or a joint that slides,
-    InsufficientDataError if it still does not fit (unless --unchecked).
+    InsufficientDataError if it still does not fit (unless --unchecked). Nothing is written
+    then.
     """
     folder: Path = args.files[0]
     points = [name.lower() for name in args.points]
@@ -203,7 +204,10 @@ def _mend(args: argparse.Namespace) -> int:
 def _import_moving(
     args: argparse.Namespace, cell: Workcell | None, urdf: str, chain: SerialChain
 ) -> int:
-    """Write the session of a bag whose arm moved; errors as of `run`."""
+    """Write the session of a bag whose arm moved; print how it was read; return 0.
+
+    ``cell``: None if the arm is given by a URDF; ``urdf, chain``: the arm. Raises as `run`.
+    """
     for option, given in (
         ('--couple', args.couple),
         ('--reverse', args.reverse),
@@ -316,7 +320,10 @@ def _read(args: argparse.Namespace, urdf: str, chain: SerialChain) -> RawRows:
 
 
 def _session_options(args: argparse.Namespace, cell: Workcell | None) -> SessionOptions:
-    """Return the options of the session; what is not given comes from the cell, if any."""
+    """Return the options of the session; sensor, marker and its place from the cell if not given.
+
+    ``cell``: None for none: names are 'sensor' and 'marker' then, the place is unknown.
+    """
     sensor, marker, place, std = args.sensor, args.marker, args.marker_mm, args.marker_std_mm
     if cell is not None:
         sensor = sensor or cell.aim_at
@@ -350,7 +357,7 @@ def _names_not_used(args: argparse.Namespace, rows: RawRows) -> Iterator[str]:
 def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
     """Return a summary of the tables and of their interpretation, as text.
 
-    ``how``: lines that are added at the end.
+    ``rows``: as read; ``session``: made of them; ``how``: lines that are added at the end.
     """
     width = max(map(len, rows.columns))
     lines = [*rows.description]
@@ -368,7 +375,11 @@ def _as_text(rows: RawRows, session: Session, how: list[str]) -> str:
 
 
 def _as_json(out: Path | None, rows: RawRows, sense: Sense) -> dict[str, Any]:
-    """Summary of an import for --json: session, columns, warnings, fit and rows far off."""
+    """Return the summary of an import for --json: session, columns, warnings, fit, rows far off.
+
+    ``out``: folder of the session, None if it is not written; ``sense``: whether it fits the
+    arm.
+    """
     return {
         'session': None if out is None else str(out),
         'columns': rows.columns,

@@ -250,9 +250,9 @@ def add_session(parser: argparse.ArgumentParser) -> None:
 
 
 def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
-    """Argument type: a joint, and another one that is added to it (1) or subtracted (-1).
+    """Argument type: a joint to which another one is added (1) or subtracted (-1).
 
-    JOINT=JOINT or JOINT=-JOINT; ArgumentTypeError for another form.
+    JOINT=OTHER or JOINT=-OTHER, as (joint, (other, sign)); ArgumentTypeError for another form.
     """
     name, sign, other = text.partition('=')
     if not (name and sign and other.lstrip('+-')):
@@ -275,9 +275,9 @@ def _stretch(text: str) -> Stretch:
 
 
 def _turn(text: str) -> tuple[str, float]:
-    """Argument type: an axis x, y or z, and an angle of up to 360 degrees, AXIS=DEGREES.
+    """Argument type: an axis and an angle from -360 to 360 degrees, AXIS=DEGREES.
 
-    ArgumentTypeError for another form.
+    The axis is x, y or z; ArgumentTypeError for another form.
     """
     axis, sign, angle = text.partition('=')
     if axis not in ('x', 'y', 'z') or not sign:
@@ -286,7 +286,10 @@ def _turn(text: str) -> tuple[str, float]:
 
 
 def _pulses(text: str) -> tuple[float, ...]:
-    """Argument type: pulses per degree of each joint, with commas; ArgumentTypeError for a 0."""
+    """Argument type: pulses per degree of each joint, numbers with commas between.
+
+    ArgumentTypeError for a 0 or what is no number.
+    """
     counts = tuple(number(-1e9, 1e9)(part) for part in text.split(','))
     if not all(counts):
         raise argparse.ArgumentTypeError(f'{text!r}: no joint has 0 pulses a degree')
@@ -294,7 +297,7 @@ def _pulses(text: str) -> tuple[float, ...]:
 
 
 def _offset(text: str) -> tuple[str, float]:
-    """Argument type: a joint and an angle of up to 360 degrees, JOINT=DEGREES.
+    """Argument type: a joint and an angle from -360 to 360 degrees, JOINT=DEGREES.
 
     ArgumentTypeError for another form.
     """

@@ -157,12 +157,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _urdf_file(robot: Path, out: Path, text: str) -> Path:
-    """Return the URDF that the cell names: the given one, or the expanded xacro.
+    """Return the path of the URDF that the cell will name; nothing is written.
 
-    ``text``: its URDF, with which a file there already is no conflict; ``out``: the cell file, in
-    whose folder the expanded xacro belongs. Nothing is written.
+    The given file, or, of a xacro, the file for its expansion in the folder of the cell file.
+    ``robot``: given path; ``out``: path of the cell file; ``text``: the URDF.
 
-    Raises InputError if that would replace a file.
+    Raises InputError if that file exists with other content.
     """
     if not is_xacro(robot):
         return robot
@@ -238,9 +238,10 @@ def _propose(
 
 
 def _meshes(text: str, robot: Path, package_path: list[Path]) -> tuple[list[str], list[str]]:
-    """Return the folders of the collision meshes, and the names of those that were not found.
+    """Return folders in which the collision meshes are found, and names of the missing ones.
 
-    ``text``: URDF; ``robot``: its path, from which relative names count.
+    ``text``: URDF; ``robot``: its path, from which relative names count; ``package_path``:
+    further folders of packages.
     """
     folders: dict[str, None] = {}
     missing = []
@@ -288,9 +289,10 @@ def _narrowed(
 
 
 def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
-    """Return the number of fitted poses with a free path (at most `FEWEST_FITTED`), and tried.
+    """Return the number of poses to fit with a free path, and of those tried.
 
-    ``seed``: of the start, as in `free_start`.
+    The count ends at `FEWEST_FITTED`. ``tour``: of the poses; ``seed``: of the configuration
+    that the paths start from, as in `free_start`.
     """
     return count_with_free_path(tour, scene.model, free_start(scene.model, seed), FEWEST_FITTED)
 
@@ -298,10 +300,11 @@ def _reached(scene: PlanningScene, tour: Tour, seed: int) -> tuple[int, int]:
 def _plan(
     cell: Workcell, without_meshes: bool, seed: int
 ) -> tuple[dict[str, Any], str, tuple[int, int]]:
-    """Return a plan in the new cell as JSON and as text, and counts of poses with a free path.
+    """Plan in the new cell; return the plan for JSON, as text, and counts of poses.
 
-    Planned as by the nodes, with only as many paths as show whether there are any. If no pose is
-    left to fit, the plan is None with the reason, and the counts are 0.
+    Planned as by the nodes, with only as many paths as show whether there are any. The counts
+    are those of poses to fit with a free path, and of those tried. If no pose is left to fit,
+    the plan is None, with the reason, and the counts are 0.
     """
     chain = cell.chain()
     scene = cell.planning_scene(chain, without_meshes=without_meshes)
@@ -366,7 +369,10 @@ def _as_json(out: Path, p: CellProposal) -> dict[str, Any]:
 
 
 def _kinematics_as_json(kinematics: InverseKinematics) -> dict[str, Any]:
-    """Return the method of the inverse kinematics for --json; None without a closed form near."""
+    """Return the method of the inverse kinematics for --json.
+
+    Its distance from the nearest closed form is in mm and deg, None without such a form.
+    """
     off = kinematics.difference
     return {
         'way': kinematics.method,

@@ -95,8 +95,8 @@ def _mending(args: argparse.Namespace, options: str) -> str:
 def _keep_freed_memory() -> None:
     """Make the C library reuse freed memory instead of returning it to the kernel.
 
-    Returned and allocated again, with zeros in every page, it takes a tenth of the time of a large
-    session.
+    Returning and allocating it again, with zeros in every page, would take a tenth of the time
+    of a large session. Nothing if the C library has no mallopt.
     """
     c_library = ctypes.CDLL(None)
     # Of other systems' libraries none has it.
@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _complete() -> None:
-    """Answer a shell that completes a line, and exit."""
+    """Answer a shell that completes a command line (argcomplete), and exit."""
     # Imported here: it is only of use to a shell.
     import argcomplete
 

@@ -17,13 +17,13 @@ CANDIDATES = 60
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser whose errors are one line; options cannot be abbreviated."""
+    """Argument parser whose errors are one line, and whose options cannot be abbreviated."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{**kwargs, 'allow_abbrev': False})
 
     def error(self, message: str) -> NoReturn:
-        """Print one line and exit with status 2."""
+        """Print the error as one line on stderr, and exit with status 2."""
         self.exit(2, f'error: {message} (see {self.prog} --help)\n')
 
 
@@ -67,7 +67,7 @@ def _bounded(
 
 
 def add_poses(parser: argparse.ArgumentParser) -> None:
-    """Add the options for numbers of candidate poses."""
+    """Add the options --poses and --validation, numbers of candidate poses."""
     for option, low, what in (('--poses', 1, 'to fit'), ('--validation', 0, 'held out')):
         parser.add_argument(
             option,

@@ -147,7 +147,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> TravelTime:
-    """Return the travel times of the arm, by the options for speeds, settling and dwell."""
+    """Return the model of the time that motion and measuring take, by the command's options.
+
+    ``args``: share of joint speeds, largest speed of a point (0 for none), settling and dwell.
+    Accelerations are those of the cell.
+    """
     return TravelTime.of(
         scene.model,
         args.speed_share,
@@ -161,9 +165,10 @@ def _travel(cell: Workcell, scene: PlanningScene, args: argparse.Namespace) -> T
 def _check(
     cell: Workcell, scene: PlanningScene, plan: CollectionPlan, args: argparse.Namespace
 ) -> tuple[dict[str, Any], str]:
-    """Choose and write the configurations of a check; return its sensitivity (JSON, text).
+    """Choose the configurations of a check among the plan's, and write them as a table.
 
-    Raises InsufficientDataError if too few configurations can be reached.
+    Returns the smallest changes that the check detects, for JSON and as text. Raises
+    InsufficientDataError if fewer than `CHECK_POSES` are planned.
     """
     chain = scene.model.chain
     q = np.unique([visit.q for visit in plan.visits], axis=0)
@@ -204,7 +209,8 @@ def planned(
 ) -> CollectionPlan:
     """Return the collection as the nodes plan it, with sensors at their rough positions.
 
-    ``progress``: called with the share done, 0 to 1. Raises as `plan_collection` and
+    ``args``: options of ``remaster plan``; ``progress``: called with the share done, 0 to 1.
+    Raises InputError if motion cannot be measured (--moving); else as `plan_collection` and
     `read_causes`.
     """
     travel = _travel(cell, scene, args)
@@ -233,7 +239,10 @@ def planned(
 def _check_moving(
     cell: Workcell, scene: PlanningScene, args: argparse.Namespace, travel: TravelTime
 ) -> None:
-    """Raise InputError if motion cannot be measured, with the time that stop and go takes."""
+    """Raise InputError if this cell or --separate does not allow measuring in motion.
+
+    For a cell the error has the time that stop and go would take instead.
+    """
     if args.separate:
         raise InputError(
             '--separate adds configurations at standstill, and --moving has none to fit; leave '

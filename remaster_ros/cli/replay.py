@@ -73,9 +73,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _write(args: argparse.Namespace) -> int:
-    """Write the session of the bag; compare it with the recorded one.
+    """Write the session of the bag, and compare its rows with the recorded ones; return 0.
 
-    Raises InputError for an invalid bag, InsufficientDataError if rows differ.
+    Raises InputError for an invalid bag or options for a replay over ROS,
+    InsufficientDataError if rows differ or the end of the bag is torn; the session is written
+    then.
     """
     given = {
         '--rate': args.rate is not None,

@@ -18,11 +18,12 @@ log = logging.getLogger('remaster_ros')
 
 
 def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
-    """Read one session or several of one arm; return it, and lines on renamed rows.
+    """Read one session, or several of one arm as one; return it, and lines to print.
 
-    The lines are [] for one session. Disagreements between sessions are logged as warnings, and
-    kept in the session. Raises InputError if a session cannot be read, or zero-offsets show that
-    arms differ; MistakeFoundError as `read_to_fit`.
+    The lines say what is renamed, and which sessions cannot be compared; [] for one session.
+    Disagreements between sessions are logged as warnings, and kept in the session. Raises
+    InputError if a session cannot be read, or zero-offsets show that arms differ;
+    MistakeFoundError as `read_to_fit`.
     """
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
     if len(sessions) == 1:
@@ -35,9 +36,10 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
 
 
 def _one_arm(session: Session, folder: Path) -> Session:
-    """Return the session; InputError if a correction was on for some rows and off for others.
+    """Return the session unchanged, unless a correction was on for some of its rows only.
 
-    Only a correction in the controller counts, by which reported angles mean two things.
+    Raises InputError then, but only for a correction in the controller, with which reported
+    angles mean two things. ``folder``: for the error.
     """
     on = session.is_corrected
     correction = session.correction
@@ -53,7 +55,7 @@ def _one_arm(session: Session, folder: Path) -> Session:
 def refuse_moving(session: Session, folder: Path, verb: str) -> None:
     """Raise InputError if the arm moved while a session was measured.
 
-    ``folder, verb``: for the message.
+    ``folder``: of the session, ``verb``: that does not take it, both for the message.
     """
     if session.is_moving:
         raise InputError(

@@ -111,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Plan, draw a truth, write the session and the truth.
+    """Plan, draw a truth, write the session and the truth; return 0.
 
     Raises InputError for invalid options, InsufficientDataError if no pose can be planned.
     """

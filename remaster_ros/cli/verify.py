@@ -80,9 +80,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def visits(session: Session, folder: Path) -> Visits:
-    """Return all rows of a session as visits; ``folder``: for messages.
+    """Return all rows of a session as visits, for `verify`; ``folder``: for messages.
 
-    Raises InputError if a row does not tell whether the correction was on, or what was wanted.
+    Raises InputError if a row does not tell whether the correction was on, or which joint
+    angles were wanted.
     """
     m = session.measurements
     on = _on(session, folder)
@@ -98,9 +99,11 @@ def visits(session: Session, folder: Path) -> Visits:
 
 
 def _together(configuration: IntArray, wanted: FloatArray, units: JointUnits) -> IntArray:
-    """Return configuration numbers, (n,), with repeated visits numbered as the first one.
+    """Return configuration numbers, (n,), in which repeated visits have that of the first one.
 
-    Repeated is a visit with the same wanted joints, as `nearest_solution` judges.
+    A visit is repeated if it has the same wanted joints as an earlier one
+    (`nearest_solution`). ``configuration``: numbers of the rows, (n,); ``wanted``: rad or m,
+    (n, k).
     """
     numbers, firsts = configuration.copy(), dict[int, FloatArray]()
     for each in dict.fromkeys(configuration.tolist()):
@@ -123,8 +126,8 @@ def _chain(session: Session) -> SerialChain:
 def _on(session: Session, folder: Path) -> BoolArray:
     """Return whether the correction was on at each row, (n,).
 
-    Unknown rows are on if the session states a correction; else InputError, with the first of
-    them. ``folder``: of the session, for the error.
+    Rows of which it is not known count as on if the session states a correction; else
+    InputError, with the first of them. ``folder``: of the session, for the error.
     """
     m = session.measurements
     state = np.full(len(m), -1) if m.correction is None else m.correction
@@ -142,8 +145,8 @@ def _on(session: Session, folder: Path) -> BoolArray:
 def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
     """Return the desired joint angles, rad, (n, k): the columns ``wanted`` of the session.
 
-    Where these are empty, the reported angles of rows with the correction ``on``, (n,), if it is
-    inside the controller. Raises InputError, with the ``folder``, if a row has neither.
+    If these are empty in a row, its reported angles, if the correction was on (``on``, (n,))
+    and is inside the controller. Raises InputError, with the ``folder``, if a row has neither.
     """
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()
@@ -164,10 +167,11 @@ def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
 
 
 def require_same_arm(session: Session, compensation: Compensation, folder: Path) -> None:
-    """Raise InputError for a session of another arm, and for the one of the correction.
+    """Raise InputError if a session cannot be judged by a correction: it is of another arm.
 
-    Joints, base and tip link have to be the same by name, markers among the correction's.
-    ``folder``: for messages.
+    Joints, base and tip link have to be the same by name, and markers among the correction's.
+    Also raised for the session that the correction was computed from. ``folder``: for
+    messages.
     """
     chain, robot = _chain(session), compensation.content.robot
     for quantity, session_value, correction_value in (
@@ -195,14 +199,15 @@ def require_same_arm(session: Session, compensation: Compensation, folder: Path)
 
 
 def _named(names: Any) -> str:
-    """Return names as text."""
+    """Return names as text for a message."""
     return names if isinstance(names, str) else ', '.join(names)
 
 
 def _warnings(session: Session, compensation: Compensation) -> list[str]:
-    """Return warnings on the session, a line each: another file, accuracy option, nothing wanted.
+    """Return warnings on a session that is to be verified, as text; [] if there are none.
 
-    Also a correction that was measured on top of another one; [] if there are none.
+    Warned of are: another file than the correction that was on, another accuracy option of the
+    maker, no wanted joints, a correction that was measured on top of another one.
     """
     state = compensation.content.state
     stated, before = session.correction, state.get('correction')
@@ -229,7 +234,7 @@ def _warnings(session: Session, compensation: Compensation) -> list[str]:
 
 
 def _content(found: VerificationResult, warnings: list[str]) -> dict[str, Any]:
-    """Return the verdict for --json."""
+    """Return the result of a verification as printed by --json."""
     return {
         'format': FORMAT,
         'verdict': found.verdict,
@@ -249,7 +254,10 @@ def _content(found: VerificationResult, warnings: list[str]) -> dict[str, Any]:
 
 
 def _in_words(found: VerificationResult) -> str:
-    """Return the verdict as a sentence, with the number of poses that would do if unclear."""
+    """Return the verdict of a verification as a sentence.
+
+    If it is 'unclear', followed by the number of poses that would do, or that no number would.
+    """
     words = WORDS[found.verdict]
     if found.verdict != 'unclear':
         return words
@@ -262,7 +270,11 @@ def _in_words(found: VerificationResult) -> str:
 
 
 def _text(found: VerificationResult) -> str:
-    """Return the printed table and verdict."""
+    """Return what ``remaster verify`` prints: the verdict, then a line for each figure.
+
+    Figures: shares of the correction that act, of all joints and of each; mean errors off and
+    on, mm, each if there are such rows; RMS of what remains, mm.
+    """
     lines = [f'{found.verdict}: {_in_words(found)}']
     lines.append(f'share that acts, of the rows with it on: {_share(found.absolute)}')
     if found.toggle is not None:

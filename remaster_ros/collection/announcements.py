@@ -75,11 +75,12 @@ class Announcements:
         self._started = {node: heard.started for node, heard in self._heard()}
 
     def lack(self) -> Lack:
-        """Return whether the visit under way has to be announced (again), and how.
+        """Return whether, and how, the visit under way has to be announced (again).
 
-        A node that was restarted after the announcement lacks it, and one whose state shows
-        another pose some time later. While the recorder measures nothing is announced, since the
-        outcome changes the remaining solutions.
+        `Lack.ANEW` if it was not announced, or a node that does not show it was started since.
+        `Lack.LATE` if a node still shows another pose after the wait of `announced`. While the
+        recorder measures nothing is announced, since the outcome changes the remaining
+        solutions.
         """
         if (recorder := self._peers.recorder) is not None and recorder.state == 'measuring':
             return Lack.NOTHING
@@ -92,10 +93,10 @@ class Announcements:
         return Lack.LATE if any(state.wall > missed_wall for _, state in lacking) else Lack.NOTHING
 
     def _heard(self) -> list[tuple[str, LastState]]:
-        """Return the last states of bridge and recorder, as far as received."""
+        """Return name and last state of bridge and recorder, if it has come."""
         states = [(node, self._peers.heard(node)) for node in PEERS]
         return [(node, heard) for node, heard in states if heard is not None]
 
     def retract(self) -> None:
-        """Have the remaining solutions announced with a new stamp."""
+        """Discard the stamp, so that the remaining solutions are announced with a new one."""
         self.stamp = ''

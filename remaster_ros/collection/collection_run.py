@@ -14,7 +14,7 @@ NOT_LIVING = 'its run was in another boot of this computer, or was ended'
 
 
 class CollectionRun:
-    """State of the planner and token of its run.
+    """State of the planner, and the token of its run of the collection.
 
     Parameters
     ----------
@@ -38,10 +38,12 @@ class CollectionRun:
         self.state, self.why, self.token, self.left = 'idle', '', '', ''
 
     def resume(self, state: str, token: str, progress: str) -> None:
-        """Restore the state of a planner before this one; of a running run, its token in `left`.
+        """Restore the state that the last planner process wrote: `complete`, or else `idle`.
 
-        ``state``, ``token``: as last written; ``progress``: of the collection, as text. The state
-        is ``complete`` or else ``idle``, with `why`.
+        For a new object. If that state was ``running``, its token goes to `left`, for
+        `take_up`. Unless the state is ``complete``, `why` says that the planner waits for
+        /remaster/collect. ``state``, ``token``: as last written; ``progress``: of the
+        collection, text for `why`.
         """
         if state == 'complete':
             self.state = state
@@ -58,13 +60,14 @@ class CollectionRun:
     ) -> bool:
         """Resume the run of a killed planner if it still lives; return whether that is decided.
 
-        It lives if the planner was silent for at most `resume_within_s`, bridge and recorder hold
-        its token, and neither a halt nor a changed setup asks for a person. Not decided before the
-        first states of both. Else `why` has the reason, and `left` is ''.
+        It lives if the planner was silent for at most `resume_within_s`, bridge and recorder
+        hold the token `left`, and neither a halt nor a changed setup asks for a person. Then
+        `state` is ``running``; else `why` has the reason. Not decided before the first states
+        of both, unless the silence rules it out. Once it is decided, `left` is ''.
 
-        ``silence_s``: time since that planner renewed its liveness file, s; None if it did not in
-        this boot of the computer, or has ended the run; ``bridge, recorder``: last states, None
-        before the first; ``progress``: of the collection, as text.
+        ``silence_s``: time since that planner renewed its liveness file, s; None if it did not
+        in this boot of the computer, or has ended the run; ``bridge, recorder``: last states,
+        None before the first; ``progress``: of the collection, as text.
         """
         reason = ''
         if silence_s is None:
@@ -120,14 +123,17 @@ class CollectionRun:
         return ''
 
     def collect(self, new_token: str) -> None:
-        """Run, with this token unless the run is running already; clears `left` and `why`."""
+        """Begin a run with this token; a run that is ``running`` goes on with its own.
+
+        The state is ``running`` then, and `left` and `why` are ''.
+        """
         self.left = ''
         if self.state != 'running':
             self.token = new_token
         self.state, self.why = 'running', ''
 
     def pause(self) -> bool:
-        """Pause the run, also one that would be resumed; return whether it is paused.
+        """End the run as ``paused``, also that of `left`; return whether the state is ``paused``.
 
         True too if it was paused before; another state is not changed.
         """
@@ -137,14 +143,15 @@ class CollectionRun:
         return self.state == 'paused'
 
     def stop(self) -> None:
-        """End the run; the remaining poses can be collected in another one."""
+        """End the run as ``stopped``; the remaining poses can be collected in another run."""
         self.left = ''
         self.end('stopped')
 
     def end(self, state: str, why: str = '', *, only_from: str = '') -> bool:
-        """End the run in a state; return False, and change nothing, if it is not `only_from`.
+        """End the run in a state, without a token; return whether that was done.
 
-        ``why``: for people; ``only_from``: '' for any state.
+        False, and nothing is changed, if the state is not `only_from` ('' for any). ``why``:
+        for people.
         """
         if only_from and self.state != only_from:
             return False
@@ -153,5 +160,8 @@ class CollectionRun:
 
 
 def _waits(progress: str, reason: str) -> str:
-    """Return a message on a planner that waits for /remaster/collect."""
+    """Return a message on a planner that waits for /remaster/collect.
+
+    ``progress``: of the collection; ``reason``: why it waits, '' if there is nothing to say.
+    """
     return f'{progress}; /remaster/collect goes on{f" ({reason})" if reason else ""}'

@@ -47,7 +47,7 @@ Outcome = Literal['recorded', 'partial', 'rejected']
 
 
 class Alive(Body, frozen=True, tag='alive'):
-    """State of a node from which other nodes need nothing else."""
+    """State of a node of which other nodes need to know only that it runs."""
 
 
 class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
@@ -275,7 +275,10 @@ class RecorderBegan(Body, frozen=True, kw_only=True, tag='began'):
 
 
 class ShotMeasured(Body, frozen=True, tag='measured'):
-    """Event: a single-shot sensor has measured, with the wall time of search and integration."""
+    """Event: a single-shot sensor has measured.
+
+    ``instrument_wall_s``: wall time of search and integration, s.
+    """
 
     instrument_wall_s: float
 
@@ -344,6 +347,8 @@ class EventRecord(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Version(msgspec.Struct):
+    """Version of a record, which is read before the rest of it."""
+
     version: int
 
 

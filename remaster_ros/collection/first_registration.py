@@ -26,7 +26,7 @@ tenth of the allowed distance (the error of an uncalibrated arm), from which it 
 
 
 class FirstRegistration:
-    """Points of each sensor, which give T_R_N from the third pose on.
+    """First registrations of the sensors, by points at three configurations or more.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class FirstRegistration:
         self.troubles: dict[str, str] = {}
 
     def add(self, readings: Iterable[PairedReading]) -> list[str]:
-        """Add readings at registration poses; names of sensors registered (again) by them.
+        """Add readings at registration poses; return the sensors that they register (again).
 
         A sensor is registered with `POINTS` configurations or more; if its points give no
         registration, `troubles` says why, and it keeps an earlier one. Raises KeyError for an
@@ -100,11 +100,12 @@ class FirstRegistration:
         return registered
 
     def _frame(self, options: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
-        """T_R_N by the choice of markers that agrees best: most points, then least RMS.
+        """Registration, (4, 4), by the choice of markers that agrees best.
 
-        ``options``: places that each point may have, (m, 3) each; ``measured``: (n, 3), m. Raises
-        InsufficientDataError if no choice gives a registration, or another one agrees as well
-        (`CLEARLY_WORSE`).
+        That has most points within `allowed_m`, then the least RMS. ``options``: places in the
+        robot base frame that each point may have, m, (m, 3) each; ``measured``: in the
+        sensor's frame, (n, 3), m. Raises InsufficientDataError if no choice gives a
+        registration, or another one agrees as well (`CLEARLY_WORSE`).
         """
         failure: InsufficientDataError | None = None
         found = []

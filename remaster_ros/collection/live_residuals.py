@@ -25,7 +25,9 @@ MOST = 2000
 
 
 class LiveResiduals:
-    """Pairs of a settled configuration and the mean of each sensor's readings there.
+    """Residuals of the markers' positions during a collection, for display.
+
+    They are of pairs of a settled configuration and the mean of each sensor's readings there.
 
     Parameters
     ----------
@@ -84,12 +86,15 @@ class LiveResiduals:
         self._q = None
 
     def use_offsets(self, joint_offsets: FloatArray) -> None:
-        """Use these zero-offsets for the residuals from now on, rad, (k,)."""
+        """Use these joint zero-offsets for all residuals from now on, rad, (k,)."""
         self._offsets = joint_offsets
         self._found.clear()
 
     def use_markers(self, markers: Mapping[str, FloatArray]) -> None:
-        """Use these fitted markers from now on, marker -> m, (3,); other names are ignored."""
+        """Use these fitted marker positions from now on, by name, m, (3,) each.
+
+        Names that no sensor has are ignored; markers that are not given keep their positions.
+        """
         for places in self._markers.values():
             places.update({name: markers[name] for name in places if name in markers})
         self._found.clear()
@@ -116,23 +121,24 @@ class LiveResiduals:
         return self._registering[sensor]
 
     def points_R(self, sensor: str) -> FloatArray:
-        """Measured points in the robot base, m, (n, 3); n = 0 with fewer than `FEWEST`.
+        """Measured points in the robot base frame, m, (n, 3); n = 0 with fewer than `FEWEST`.
 
-        In the order of `norms_m`; n = 0 also if they do not register the sensor. Raises KeyError
-        for an unknown sensor.
+        In the order of `norms_m`; n = 0 also if they do not register the sensor. Raises
+        KeyError for an unknown sensor.
         """
         return self._fitted(sensor)[1]
 
     def _fitted(self, sensor: str) -> tuple[FloatArray, FloatArray]:
-        """`_fit` of a sensor, computed only after its pairs, markers or offsets have changed."""
+        """Result of `_fit`, computed anew only after pairs, markers or offsets have changed."""
         if sensor not in self._found:
             self._found[sensor] = self._fit(sensor)
         return self._found[sensor]
 
     def _fit(self, sensor: str) -> tuple[FloatArray, FloatArray]:
-        """Lengths of a sensor's residuals, (n,), and measured positions in R, (n, 3), m.
+        """Residual lengths of a sensor, m, (n,), and its points in the robot base, m, (n, 3).
 
-        The sensor is registered by its pairs; empty if they are too few or do not register it.
+        By the registration that fits all its pairs. Both are empty (n = 0) with fewer than
+        `FEWEST` pairs, or if these do not register the sensor.
         """
         pairs = self._pairs[sensor]
         nothing = np.empty(0), np.empty((0, 3))

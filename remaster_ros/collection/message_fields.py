@@ -37,7 +37,7 @@ def temperature_topic(marker_topic: str) -> str:
 
 
 class JointOrder:
-    """Joint positions by name, from messages with any order of joints.
+    """Joint positions in a wanted order, from messages that name the joints in any order.
 
     ``names``: wanted order.
     """
@@ -88,7 +88,7 @@ def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
 
 
 def refuse_repeated(wanted: Sequence[str], given: Sequence[str], topic: str) -> None:
-    """Raise InputError, with the names, if a message names a wanted joint twice.
+    """Raise InputError, with the names, if `given` has a wanted joint more than once.
 
     ``wanted, given``: names of joints; ``topic``: for the message.
     """

@@ -93,7 +93,7 @@ class Rejection:
 
 
 class Pairing:
-    """Messages of one settled configuration, and the decision on each sensor.
+    """Decision on each sensor's reading at one settled configuration, from its messages.
 
     Parameters
     ----------
@@ -243,10 +243,10 @@ class Pairing:
     def _add_silence(
         self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
     ) -> None:
-        """Add to the time, not excused yet, without messages of each sensor's node.
+        """Add to the time without messages of each sensor's node that is not excused yet.
 
-        It begins anew with a message, for an absent sensor, and for one without a count.
-        ``passed_s``: s since the last call.
+        It begins anew at 0 with a message, for an absent sensor, and for one without a count.
+        ``counts``: number of messages by sensor; ``passed_s``: time since the last call, s.
         """
         for name in self.rules:
             same = name in counts and counts[name] == self._message_counts.get(name)
@@ -259,12 +259,12 @@ class Pairing:
         return bool(self._readings[sensor])
 
     def is_required(self, sensor: str) -> bool:
-        """Whether the arm waits for this sensor, or for any; `require` decides."""
+        """Whether the arm waits for this sensor: `require` is its name, ``all`` or ``any``."""
         return self.require in ('all', 'any', sensor)
 
     @property
     def complete(self) -> bool:
-        """Whether all sensors are decided, or those that the arm waits for.
+        """Whether the arm needs to wait no longer: all sensors are decided, or the required one.
 
         With ``any``: once one of them has a reading.
         """
@@ -279,7 +279,7 @@ class Pairing:
         self._reject_undecided('not_waited', f'the arm waits for {self.require}')
 
     def waited_s(self) -> dict[str, float]:
-        """Waiting time of the arm for each sensor, s: from one decision to the next.
+        """Time that the arm waited for each sensor, s: from the decision before it to its own.
 
         The first from the settling; 0 for a sensor that is not decided.
         """

@@ -27,7 +27,7 @@ SILENT_S = 3.0
 
 
 class PeerModels:
-    """Arms that the other nodes compute with.
+    """Comparison of the arm models that other nodes compute with to that of this node.
 
     ``node``: name of this node with its namespace; ``model``: arm that it computes with.
     """
@@ -38,9 +38,10 @@ class PeerModels:
         self._peers: dict[str, tuple[float, str]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Compare the arm in another node's record with this one's; `now`: wall time, s.
+        """Compare the arm model in another node's record with this node's; keep the difference.
 
-        A planner that names no arm is a fault; records of this node are ignored.
+        A planner that names no arm is a fault; records of this node, and of other nodes
+        without a model, are ignored. ``now``: wall time, s.
         """
         if record.node == self._node:
             return
@@ -105,7 +106,7 @@ class RequiredSensors:
         return '; '.join(f'{name}: {absent[name]}' for name in gone)
 
     def are_among(self, found: Collection[str]) -> bool:
-        """Whether the sensors that the arm waits for are among these."""
+        """Whether `found` has all sensors that the arm waits for, or, of `any_of_them`, one."""
         known = [name in found for name in self.names]
         return any(known) if self.any_of_them else all(known)
 
@@ -119,7 +120,7 @@ class LastState(NamedTuple):
 
 
 class Peers:
-    """Last states of bridge, recorder and sensors.
+    """Last states of bridge, recorder and sensors, by their records.
 
     ``sensors``: all sensors of the cell.
     """
@@ -131,7 +132,7 @@ class Peers:
         self._reports: dict[str, tuple[SensorReport, float]] = {}
 
     def take(self, record: EventRecord, now: float) -> None:
-        """Keep a state of bridge, recorder or a sensor; other records are ignored.
+        """Keep the state of bridge, recorder or a sensor in a record; other records are ignored.
 
         ``now``: wall time of its arrival, s.
         """
@@ -158,7 +159,7 @@ class Peers:
         return heard.body if heard and isinstance(heard.body, RecorderState) else None
 
     def required(self) -> RequiredSensors:
-        """Sensors that the arm waits for, by the recorder's settings; all before they came.
+        """Sensors that the arm waits for, by the recorder's last state; before one, all.
 
         Raises InputError if the recorder waits for a sensor that this cell does not have.
         """

@@ -69,11 +69,11 @@ class PlanConfirmation:
         self._pending: set[str] = set()
 
     def withdraw(self) -> None:
-        """Mark the page as outdated, as another plan is next; a confirmation stays."""
+        """Mark the page as outdated, as another plan is next; `confirmed` stays."""
         self.shown = self.trouble = ''
 
     def show(self, plan: str) -> None:
-        """Mark a plan as shown on the page."""
+        """Note that the page shows the plan with this fingerprint."""
         self.shown, self.trouble = plan, ''
         if plan != self.confirmed:
             self._pending.add(plan)

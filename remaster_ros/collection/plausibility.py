@@ -98,13 +98,14 @@ class Plausibility:
     def judge(
         self, reading: PairedReading, T_R_N: FloatArray | None, *, anywhere: bool = False
     ) -> PairedReading | Rejection:
-        """The reading, or the reason why it is not plausible.
+        """Return the reading, or a Rejection with the reason why it is not plausible.
 
-        ``frozen``: the same to the last bit as the one before, though the arm moved (`MOVED_M`,
-        `TURNED_RAD`); ``swapped``: further from the model than allowed. Plausible readings are
-        kept to judge later ones. ``T_R_N``: sensor in the robot base, (4, 4), None before it is
-        registered, when only ``frozen`` is judged; ``anywhere``: at a reference, where a deviation
-        shows a change, any deviation up to `max_deviation_m` is plausible.
+        ``frozen``: the same to the last bit as the one before, though the arm moved
+        (`MOVED_M`, `TURNED_RAD`); ``swapped``: further from the model than allowed. Plausible
+        readings are kept to judge later ones. ``T_R_N``: sensor in the robot base, (4, 4),
+        None before it is registered, when only ``frozen`` is judged; ``anywhere``: at a
+        reference, where a deviation shows a change, any deviation up to `max_deviation_m` is
+        plausible.
         """
         name = reading.sensor
         marker_R = self._place(reading)
@@ -133,7 +134,7 @@ class Plausibility:
         return reading
 
     def _place(self, reading: PairedReading) -> FloatArray:
-        """Position of the marker by the robot's model, in R, m, (3,)."""
+        """Marker position by the robot's model for a reading, in the robot base, m, (3,)."""
         return self._chain.positions(reading.q, np.asarray(self._markers[reading.marker], float))
 
     def _allowed_m(self, sensor: str) -> float:

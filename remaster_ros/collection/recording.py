@@ -62,7 +62,7 @@ class SettledArm:
 
 @dataclass(frozen=True)
 class EndedReading:
-    """Outcome of a configuration."""
+    """Outcome of a configuration: its readings, and why others are missing."""
 
     settled: SettledArm  # The configuration
     from_q: FloatArray | None  # Configuration before the motion, rad, (k,); None if unknown
@@ -79,9 +79,10 @@ class EndedReading:
 
     @property
     def result(self) -> Outcome:
-        """Outcome: ``rejected`` without any reading, ``partial`` if some are missing.
+        """Outcome: ``rejected`` without readings, ``partial`` if some are missing, ``recorded``.
 
-        Missing is a sensor that was waited for and not absent; else ``recorded``.
+        Readings are missing of sensors that were rejected for another reason than
+        ``not_waited`` or ``absent``.
         """
         if not self.accepted:
             return 'rejected'
@@ -109,7 +110,7 @@ class EndedReading:
 
 
 class Recording:
-    """Readings of one settled configuration after another.
+    """Readings of settled configurations, one after the other.
 
     Parameters
     ----------
@@ -207,12 +208,13 @@ class Recording:
     def take_settled(
         self, stamp_s: float, q: FloatArray, change: FloatArray | None = None
     ) -> bool:
-        """Process that the arm has settled; returns whether it is at a known solution.
+        """Process that the arm has settled; return whether it is at a known solution.
 
-        Solutions are wanted joints: if a correction has changed the joints, rad, (k,), the change
-        is subtracted first. At an unknown solution, either the planner finds by the recorder's
-        state that the pose is not known here and announces it again, or the announcement has not
-        arrived yet. ``stamp_s``: when it settled.
+        If so, the configuration is queued to be read. Solutions are wanted joints: if a
+        correction has changed the joints, rad, (k,), that ``change`` is subtracted first. At
+        an unknown solution, either the planner finds by the recorder's state that the pose is
+        not known here and announces it again, or the announcement has not arrived yet: see
+        `look_again`. ``stamp_s``: when it settled.
         """
         self._unknown = None
         if self._queue(q, stamp_s, change):
@@ -237,7 +239,7 @@ class Recording:
 
     @property
     def is_idle(self) -> bool:
-        """Whether no reading is in progress and none is due."""
+        """Whether no reading is in progress and no configuration is queued to be read."""
         return self.pairing is None and not self._due
 
     def _queue(self, q: FloatArray, stamp_s: float, change: FloatArray | None) -> bool:
@@ -272,9 +274,9 @@ class Recording:
             self._unknown = None
 
     def next(self) -> SettledArm | None:
-        """Configuration that is to be read now, once; None if there is none.
+        """Remove the next configuration from the queue, and return it; None if there is none.
 
-        None also while a reading is in progress.
+        None, without a change, while a reading is in progress.
         """
         return self._due.popleft() if self._due and self.pairing is None else None
 
@@ -315,7 +317,11 @@ class Recording:
             self.pairing.give_up(self.now_s, absent, words)
 
     def is_open(self, stamp: str, solution: int) -> bool:
-        """Whether a configuration is in progress or due, by its announcement's stamp and index."""
+        """Whether a settled configuration is being read or is queued to be read.
+
+        ``stamp``: of the announcement of its pose; ``solution``: index of its joint solution
+        there.
+        """
         under_way = [] if self._settled is None else [self._settled]
         return any(
             (settled_arm.pose.stamp, settled_arm.solution) == (stamp, solution)
@@ -378,9 +384,10 @@ class Recording:
         )
 
     def _in_fixed_frame(self, item: PairedReading | Rejection) -> PairedReading | Rejection:
-        """Reading as one of a fixed sensor.
+        """Decision on a sensor; a reading of a camera on the tool becomes that of a fixed sensor.
 
-        For a camera on the tool it is the camera's pose in its target's frame.
+        It is the camera's pose in its target's frame then, or a Rejection (``device``) if it
+        has no orientation. Other readings and rejections are returned as they are.
         """
         if isinstance(item, Rejection) or item.sensor not in self._on_tool:
             return item
@@ -390,7 +397,11 @@ class Recording:
         return item.inverted()
 
     def _count_unseen(self, accepted: Sequence[PairedReading]) -> None:
-        """Count configurations in a row in which a sensor measured, but not this marker of it."""
+        """Count, by marker, successive configurations at which its sensor measured only others.
+
+        A reading of the marker ends its count; a configuration without any reading of the
+        sensor is not counted.
+        """
         seen = {(reading.sensor, reading.marker) for reading in accepted}
         measured = {reading.sensor for reading in accepted}
         for rules in self._rules:
@@ -415,10 +426,10 @@ class Recording:
         )
 
     def _temperature_c(self, stamp_s: float) -> float | None:
-        """Last temperature before a time, °C; None if it is older than `TEMPERATURE_S`.
+        """Last temperature at or before a time, °C; None if it is `TEMPERATURE_S` old or older.
 
-        The temperature of the reading itself is not used: it is on a separate topic and may come
-        after the point, and a replay must write the same as the recording.
+        The temperature of the reading itself is not used: it is on a separate topic and may
+        come after the point, and a replay must write the same as the recording.
         """
         known = [item for item in self._temperatures if 0.0 <= stamp_s - item[0] < TEMPERATURE_S]
         return max(known)[1] if known else None

@@ -108,7 +108,7 @@ class ReferenceReading(PairedReading):
 
 @dataclass(frozen=True)
 class SetupChange:
-    """Change of the set-up."""
+    """Change of the set-up: which part moved, when, and how far."""
 
     # ``sensor``, ``base``, ``marker``, ``tool``, ``joint``, or ``unexplained`` (no one cause) or
     # ``unsteady`` (the references do not repeat from the first)
@@ -125,7 +125,11 @@ class SetupChange:
     look_alikes: tuple[str, ...] = ()  # Other subjects that explain the same readings
 
     def describe(self) -> str:
-        """Sentence on the change: what, when (by configurations), size in mm, look-alikes."""
+        """Sentence on the change: what changed, between which configurations, size, look-alikes.
+
+        Size: largest displacement at the references, mm, and the turn, if any. Look-alikes:
+        the other causes that explain the same readings; left out if there are none.
+        """
         turn = ''
         if self.turn_rad is not None:
             turn = f' and turned by {np.rad2deg(self.turn_rad) * 60:.1f} arc minutes'
@@ -155,12 +159,13 @@ class ReferenceRound:
 
 
 class ReferenceWatch:
-    """Judgement of each round of the references.
+    """Detector of changes of the set-up, by the rounds of visits to reference configurations.
 
-    ``chain``: the arm as drawn, for its own part of the displacement between two visits, within
-    its repeatability; ``markers``: nominal positions in the tool frame, m, (3,); ``stop_m``:
-    largest difference of the first two rounds that can show later changes, m. Attributes:
-    ``change``: last change found since the beginning or `accept`; None without a change.
+    ``chain``: the arm as drawn, for its own part of the displacement between two visits,
+    within its repeatability; ``markers``: nominal positions in the tool frame, m, (3,);
+    ``stop_m``: largest difference of the first two rounds that can show later changes, m.
+    Attributes: ``change``: last change found since the beginning or `accept`; None without a
+    change.
     """
 
     def __init__(
@@ -185,7 +190,7 @@ class ReferenceWatch:
 
     @property
     def rounds(self) -> int:
-        """Number of rounds that have begun."""
+        """Number of rounds of visits to the references that have begun."""
         return len(self._rounds)
 
     def add(self, reading: ReferenceReading) -> None:
@@ -236,10 +241,11 @@ class ReferenceWatch:
         self._begins.add(self._begin)
 
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> SetupChange | None:
-        """Change shown by the last round, judged once; None without a change.
+        """Judge the last round, unless it was judged before; return `change`, None without one.
 
-        ``T_R_N``: sensor -> its frame in R, (4, 4); a first registration is good enough, since
-        only differences count. A sensor without one is not judged.
+        Of the first two rounds only whether they repeat is judged. ``T_R_N``: sensor -> its
+        frame in R, (4, 4); a first registration is good enough, since only differences count.
+        A sensor without one is not judged.
         """
         number = len(self._rounds) - 1
         if number < 0 or self._rounds[number].judged:
@@ -325,7 +331,7 @@ class ReferenceWatch:
         return self.change
 
     def _displacement(self, row: ReferenceReading, T_R_N: FloatArray) -> FloatArray:
-        """Measured minus nominal marker position at the reading's joints, in R, m, (3,)."""
+        """Measured minus nominal marker position of a reading, in the robot base R, m, (3,)."""
         nominal = self._chain.positions(row.q, self._markers[row.marker])
         return np.asarray(transforms.apply(T_R_N, row.position) - nominal)
 
@@ -341,13 +347,13 @@ class ReferenceWatch:
         noise: Mapping[str, Noise],
         off: Displacements,
     ) -> float:
-        """p-value of the hypothesis that a round equals the first ones.
+        """p-value of the hypothesis that a round equals the first ones; 1.0 without any of these.
 
-        The smallest of several tests, times their number (Bonferroni), half of it for each kind:
-        all differences of a sensor, of any form; and the part of all differences that each cause
-        explains, which finds a change in one direction much sooner. 1.0 if nothing can be
-        compared. ``number``: index of the round; ``noise``: by sensor; sensors that are missing in
-        it are left out; ``off``: measured minus nominal, m.
+        The smallest of several tests, times their number (Bonferroni), half of it for each
+        kind: all differences of a sensor, of any form; and the part of all differences that
+        each cause explains, which finds a change in one direction much sooner. ``number``:
+        index of the round; ``noise``: by sensor; sensors that are missing in it are left out;
+        ``off``: measured minus nominal marker positions, m.
         """
         first = [self._begin] if self._begin else [0, 1]
         places, stds, scaled = [], [], []

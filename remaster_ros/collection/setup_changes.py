@@ -18,7 +18,7 @@ PAUSED = 'paused'
 
 
 class SetupChanges:
-    """Changes of a session's references, and those that no person has checked yet.
+    """Changes of the set-up during a session, each reported once, and the runs that they stop.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class SetupChanges:
 
     @property
     def rounds(self) -> int:
-        """Number of rounds that have begun."""
+        """Number of rounds of visits to the references that have begun."""
         return self._watch.rounds
 
     @property
@@ -101,10 +101,10 @@ class SetupChanges:
         T_R_N: Mapping[str, FloatArray],
         last: bool = False,
     ) -> bool:
-        """Process the readings at a reference; returns whether there is something new to report.
+        """Process the readings at a reference; return whether there is a new change to report.
 
-        ``configuration``: its number in the session; ``T_R_N``: registrations; ``last``: whether
-        it is the last reference of its round, which is judged then.
+        ``configuration``: its number in the session; ``T_R_N``: registrations; ``last``:
+        whether it is the last reference of its round, which is judged then.
         """
         new = False
         for reading in readings:
@@ -115,15 +115,16 @@ class SetupChanges:
         return self.judge(T_R_N) or new if last else new
 
     def leave(self, T_R_N: Mapping[str, FloatArray]) -> bool:
-        """Process that the arm goes elsewhere; returns as `read`."""
+        """Judge the round and end it, as the arm leaves the references; return as `judge`."""
         new = self.judge(T_R_N)
         self._watch.end_round()
         return new
 
     def judge(self, T_R_N: Mapping[str, FloatArray]) -> bool:
-        """Judge the round so far, once; returns whether there is something new to report.
+        """Judge the round so far, once; return whether there is a new change to report.
 
-        New is another subject, growth by more than `GROWN`, or any change of a round that `stops`.
+        New is another subject, growth by more than `GROWN` since the last report, or, of each
+        round, any change that `stops`.
         """
         self.change = self._watch.judge(T_R_N)
         if self.change is None or self.change is self._reported:

@@ -76,7 +76,7 @@ class StoppingGoal:
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """Result of a fit after some configurations."""
+    """Result of a fit of the session so far: precision, structure of the residuals, cost."""
 
     configurations: int  # Number of measured configurations to fit
     # Time from the first to the last reading of these, s; NaN if the times are unknown
@@ -101,7 +101,7 @@ class Look:
 
 @dataclass(frozen=True)
 class StoppingRule:
-    """Rule that decides by looks at the present session."""
+    """Rule that ends a collection once a fit of the session so far is precise enough."""
 
     goal: StoppingGoal  # Wanted precision
     planned: int  # Number of planned configurations to fit
@@ -130,7 +130,7 @@ class StoppingRule:
     def look(
         self, session: Session, count: int, before: Look | None, rng: np.random.Generator
     ) -> Look:
-        """Fit of the first `count` configurations, and its judgement.
+        """Fit the first `count` configurations, and return precision, structure and cost.
 
         ``session``: with at least as many configurations to fit; ``count``: one of `counts`;
         ``before``: previous look, whose structure stays found; None for none; ``rng``: for the
@@ -152,10 +152,11 @@ class StoppingRule:
         pace_s: float,
         rng: np.random.Generator,
     ) -> Look:
-        """Judgement of a fit of `count` configurations, each of which took `pace_s`.
+        """Return precision, structure and cost of a fit of `count` configurations.
 
         See `look`. ``before``: the last look, whose structure is kept, None for the first;
-        ``elapsed_s``: time measured so far; ``rng``: for `Precision.of`.
+        ``elapsed_s``: time measured so far; ``pace_s``: time per configuration, for the cost;
+        ``rng``: for `Precision.of`.
         """
         goal, measurements = self.goal, found.problem.measurements
         counting = np.ones(len(measurements), bool)
@@ -221,10 +222,10 @@ class StoppingRule:
         return f'about {look.more} more configurations to fit{time}{planned}'
 
     def _structure(self, found: Estimate, count: int) -> tuple[StructureTest, ...]:
-        """Significant tests of structure, by p-value; () if none is significant or due.
+        """Significant tests of structure in the residuals, by p-value; () if none is.
 
-        Significant is below `limit` divided by the number of tests. ``count``: number of
-        configurations at the look.
+        () also if this look makes no test. Significant is below `limit` divided by the number
+        of tests. ``count``: number of configurations at the look.
         """
         limit = self.limit(count)
         if limit == 0.0:

@@ -129,7 +129,7 @@ class TourProgress:
 
     @property
     def open_pose(self) -> PoseVisit | None:
-        """The last visit with its solutions without an outcome; None if there are none.
+        """Last visit, with its solutions that have no outcome yet; None if there are none.
 
         Its paths are not planned: see `rest`.
         """
@@ -156,12 +156,13 @@ class TourProgress:
     def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
         """Begin the next visit and return it; None while there is none to begin.
 
-        None while it is planned, while the arm cannot go on (`standing` has the reason), once when
-        the poses left to fit are dropped as enough is known, and at the end (`is_complete`).
+        None while it is planned, while the arm cannot go on (`standing` has the reason), once
+        when the poses left to fit are dropped as enough is known, while registrations that the
+        recorder reports have not arrived, and at the end (`is_complete`).
 
         ``q``: configuration of the arm, rad, (k,); ``sensors``: must be registered before the
-        collection; ``words``: state of the registration, for the message.
-        Raises InsufficientDataError if there is no registration after all its poses, or no pose is
+        collection; ``words``: state of the registration, for the message. Raises
+        InsufficientDataError if there is no registration after all its poses, or no pose is
         left to fit.
         """
         self.standing = ''
@@ -276,7 +277,7 @@ class TourProgress:
         return PlannerState(state=state, run=run, planned=self.planned, further=further)
 
     def counts(self) -> dict[str, Any]:
-        """Return figures of the tour by name, for the status; names as in the status.
+        """Return phase and numbers of poses and configurations, by the names that the status has.
 
         Sums over all tours of the session; outcomes and dropped ones with a prefix.
         """

@@ -48,7 +48,7 @@ BLOCK_ROWS = 2_000
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """Function of one driver, linear in its coefficients."""
+    """Function of one driver (an angle, torque or temperature), linear in its coefficients."""
 
     driver: Driver  # Quantity on which the function depends
     form: Form  # Shape of the m features, one for each coefficient
@@ -66,9 +66,11 @@ class Function:
         return len(self.knots) - self.degree - 1 if self.form == 'bspline' else 1
 
     def features(self, values: FloatArray) -> FloatArray:
-        """Contribution of each coefficient per unit, (n, m), at values of the driver, (n,).
+        """Values of the m features at driver values (n,), (n, m).
 
-        Splines wrap the values into their turn and hold the value of their ends beyond these.
+        The function is their sum weighted by the coefficients. Splines first wrap the values
+        into the turn at `turn_start`; beyond the first or last knot they hold the value of
+        that end.
         """
         if self.form == 'bspline':
             inside = np.clip(self._in_turn(values), *self.ends)
@@ -84,7 +86,10 @@ class Function:
         return np.asarray(wave(self.order * values))[:, None]
 
     def outside(self, values: FloatArray) -> BoolArray:
-        """Mask of the values beyond the ends of the splines, (n,); all False for other forms."""
+        """Mask of the values beyond the ends of the splines, (n,); all False for other forms.
+
+        The values of a joint that turns are first wrapped into the turn at `turn_start`.
+        """
         if self.form != 'bspline':
             return np.zeros(len(values), dtype=bool)
         low, high = self.ends
@@ -94,7 +99,10 @@ class Function:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Lowest and highest value of the driver at which the splines are defined, in its unit."""
+        """Lowest and highest driver value, in its unit, at which the splines are defined.
+
+        Meant for splines only (IndexError for forms without knots).
+        """
         return float(self.knots[self.degree]), float(self.knots[-self.degree - 1])
 
     def _in_turn(self, values: FloatArray) -> FloatArray:
@@ -107,7 +115,7 @@ class Function:
 
 @dataclass(frozen=True, eq=False)
 class JointTerm:
-    """Contribution to the angle of a joint in addition to its zero-offset."""
+    """Function of one driver that is added to the angle of a joint, besides its zero-offset."""
 
     joint: int  # Index of the joint
     effect: str  # The physical cause, as in discovery.json
@@ -117,7 +125,7 @@ class JointTerm:
 
 @dataclass(frozen=True, eq=False)
 class BaseTerm:
-    """Rotation of the whole arm about the origin of R."""
+    """Rotation of the whole arm about the origin of the robot base frame R, by one driver."""
 
     effect: str  # The physical cause
     # Function of one coefficient; with ``gravity_moment`` each axis of R has a moment of its own
@@ -130,7 +138,7 @@ Term = TypeVar('Term', JointTerm, BaseTerm)
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Shifts and rotations of the joints' origins; the last row is the tool's."""
+    """Shifts and rotations of the k joint origins and the tool (last), constant or per kelvin."""
 
     shifts: FloatArray  # In the frame of the link that the joint before moves, m, (k + 1, 3)
     turns: FloatArray  # Rotation vectors in the joint's frame, rad, (k + 1, 3)
@@ -148,7 +156,7 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Drivers:
-    """Values of the drivers in n rows."""
+    """Values, in n rows, of the quantities on which terms depend: angles, temperature, torques."""
 
     q: FloatArray  # Reported angles, rad, (n, k)
     warming: FloatArray  # Temperature above the reference temperature, K, (n,)
@@ -159,9 +167,10 @@ class Drivers:
     moment: FloatArray
 
     def of(self, function: Function) -> FloatArray:
-        """Value of the driver of a function, (n,).
+        """Values of the quantity that drives a function, (n,).
 
-        0 for the driver 'none' and for 'gravity_moment', which has three values (`base_moment`).
+        0 for the driver 'none' and for 'gravity_moment', which has three values
+        (`base_moment`).
         """
         if function.driver == 'angle':
             return self.q[:, function.joint]
@@ -174,7 +183,7 @@ class Drivers:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Kinematic state of the arm in n rows."""
+    """Joint angles, joint frames and tool pose of the calibrated arm in n rows."""
 
     drivers: Drivers
     angles: FloatArray  # True joint angles, rad, (n, k)
@@ -186,7 +195,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class ArmModel:
-    """Calibrated model of an arm of k joints."""
+    """Calibrated kinematics of an arm of k joints, with sensors, markers and covariance."""
 
     # The nominal robot, with the masses from which the torques were computed
     chain: SerialChain
@@ -240,7 +249,7 @@ class ArmModel:
 
     @cached_property
     def _needs(self) -> set[str]:
-        """Drivers that the terms need, by name, with 'lateral' if a bearing is compliant."""
+        """Names of the drivers of all terms; also 'lateral' if a bearing is compliant."""
         drivers: set[str] = {term.function.driver for term in self.joint_terms}
         drivers |= {term.function.driver for term in self.base_terms}
         return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
@@ -248,7 +257,8 @@ class ArmModel:
     def warming(self, rows: int, temperature_c: FloatArray | float | None) -> FloatArray:
         """Temperature above the reference, K, (rows,); of `mean_c` if ``temperature_c`` is None.
 
-        ``temperature_c``: °C, one number or (rows,). Zeros if nothing depends on the temperature.
+        ``rows``: number of rows; ``temperature_c``: °C, one number or (rows,). Zeros if
+        nothing depends on the temperature.
         """
         if not self.grows:
             return np.zeros(rows)
@@ -256,9 +266,10 @@ class ArmModel:
         return np.broadcast_to(given - self.reference_c, (rows,))
 
     def drivers(self, q: FloatArray, warming: FloatArray) -> Drivers:
-        """Values of the drivers at reported angles (n, k); torques are nominal ones at q + δ.
+        """Values of all drivers at reported joint angles q, rad or m, (n, k).
 
-        ``warming``: temperature above the reference, K, (n,).
+        Torques and moments are those of gravity on the nominal arm at q plus the zero-offsets;
+        zeros if no term needs them. ``warming``: temperature above the reference, K, (n,).
         """
         n, k = q.shape
         torque, base, moment = np.zeros((n, k)), np.zeros((n, 3)), np.zeros((n, k, 3))
@@ -285,16 +296,19 @@ class ArmModel:
         return added
 
     def sampled_angles(self) -> FloatArray:
-        """Uniform random configurations within the limits, rad or m, (500, k), always the same."""
+        """Uniform random configurations within the limits, rad or m, (500, k), always the same.
+
+        Limits of joints that turn are cut to ±pi.
+        """
         low, high = self.chain.usual_range
         return np.random.default_rng(0).uniform(low, high, (SAMPLED_ROWS, self.joints))
 
     def largest_slope(self) -> float:
-        """Largest slope of offsets and terms over the reported angles.
+        """Largest row sum (infinity norm) of the Jacobian of `added_angles` by reported angles.
 
-        Largest sum of the changes of one joint, rad per rad, at 500 sampled configurations; a
-        prismatic joint counts by `SerialChain.per_radian`. Below 1 there is one command for each
-        wanted angle, to which the fixed-point iteration converges (Banach).
+        At 500 sampled configurations and the reference temperature, rad per rad; a prismatic
+        joint counts in units of `SerialChain.per_radian`. Below 1 there is one command for
+        each wanted angle, to which the fixed-point iteration converges (Banach).
         """
         k, warming, unit = self.joints, np.zeros(SAMPLED_ROWS), self.chain.per_radian
         q = self.sampled_angles()
@@ -307,22 +321,26 @@ class ArmModel:
         return float(slopes.max())
 
     def state(self, q: FloatArray, temperature_c: FloatArray | float | None = None) -> State:
-        """State of the arm at reported angles (n, k).
+        """Joint angles, frames and tool pose of the arm at reported angles q, rad or m, (n, k).
 
-        ``temperature_c``: °C, one number or (n,); None for that of the measurements.
+        ``temperature_c``: °C, one number or (n,); None for the mean of the measurements.
         """
         return self._state(self.drivers(q, self.warming(len(q), temperature_c)))
 
     def rigid(self) -> SerialChain:
-        """Chain with zero-offsets, lengths and tilts built in, which takes reported angles.
+        """Serial chain with zero-offsets, lengths and tilts built in; it takes reported angles.
 
-        It has the temperature of the measurements, and no term that depends on angles or torques.
+        Growth is that at the mean temperature of the measurements. Joint terms, base terms and
+        compliance are left out.
         """
         origins = self._origins(self.warming(1, None)).reshape(-1, 4, 4)
         return replace(self.chain, T_fixed=origins).with_offsets(self.joint_offsets)
 
     def _state(self, drivers: Drivers) -> State:
-        """State of the arm at n values of the drivers: angles with all terms, frames in R."""
+        """State of the arm at n values of the drivers: angles with all terms, and frames.
+
+        Frames of the joints and the tool are in the robot base frame R.
+        """
         n, k = drivers.q.shape
         angles = drivers.q + self.added_angles(drivers)
         turned = self.chain.motions(angles)
@@ -340,10 +358,10 @@ class ArmModel:
         return State(drivers, angles, before, frames, frame @ origins[..., k, :, :])
 
     def _origins(self, warming: FloatArray) -> FloatArray:
-        """Joint origins and tool with their shifts and turns, (k + 1, 4, 4).
+        """Poses of the k joint origins and of the tool, each in the frame of the link before.
 
-        ``warming``: temperature above the reference, K, (n,); if the arm grows with it the result
-        is (n, k + 1, 4, 4).
+        (k + 1, 4, 4), nominal ones with shifts and rotations; (n, k + 1, 4, 4) if the arm
+        grows with the temperature. ``warming``: temperature above the reference, K, (n,).
         """
         shifts, turns = self.geometry.shifts, self.geometry.turns
         if self.growth.is_any:
@@ -354,7 +372,10 @@ class ArmModel:
         return transform(rotation, drawn[:, :3, 3] + shifts)
 
     def _base_turn(self, drivers: Drivers) -> FloatArray:
-        """Rotation vector of the base by all base terms, rad, (n, 3), about the axes of R."""
+        """Rotation vector of the whole arm by all base terms, rad, (n, 3).
+
+        About the axes of the robot base frame R.
+        """
         turn = np.zeros((len(drivers.q), 3))
         for term in self.base_terms:
             turn += self._base_features(drivers, term) * term.coefficients
@@ -362,18 +383,21 @@ class ArmModel:
 
     @staticmethod
     def _base_features(drivers: Drivers, term: BaseTerm) -> FloatArray:
-        """Rotation about each axis of R for a unit coefficient, rad, (n, 3).
+        """Rotation of the base for a unit coefficient of a term about each axis, rad, (n, 3).
 
-        The base moment, N m, for that driver; else the term's function, alike for all axes.
+        Axes are those of the robot base frame R. For the driver 'gravity_moment': the moment
+        about each axis, N m; for any other: the value of the term's function, the same for all
+        three axes.
         """
         if term.function.driver == 'gravity_moment':
             return drivers.base_moment
         return np.repeat(term.function.features(drivers.of(term.function)), 3, axis=1)
 
     def _lateral(self, drivers: Drivers, frame: FloatArray, joint: int) -> FloatArray:
-        """Gravity's moment on a link across its joint's axis, N m, (n, 3), in R.
+        """Gravity's moment about a joint, of all that it carries, without its part along the axis.
 
-        ``frame``: of the joint in R, (n, 4, 4); ``joint``: index from 0.
+        N m, (n, 3), in the robot base frame R. ``frame``: of the joint in R, (n, 4, 4);
+        ``joint``: index from 0.
         """
         axis = frame[:, :3, :3] @ self.chain.axes[joint]
         moment = drivers.moment[:, joint]
@@ -381,9 +405,10 @@ class ArmModel:
         return lateral
 
     def outside(self, q: FloatArray) -> BoolArray:
-        """Mask of the rows beyond a measured curve's range, (n,), temperature not considered.
+        """Mask of the configurations at which the driver of a spline is beyond its knots, (n,).
 
-        ``q``: reported angles, rad or m, (n, k).
+        Of joint terms only, and not of those driven by the temperature. ``q``: reported
+        angles, rad or m, (n, k).
         """
         drivers = self.drivers(q, np.zeros(len(q)))
         found = np.zeros(len(q), dtype=bool)
@@ -394,7 +419,10 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of all parameters, in the order of the covariance."""
+        """Names of all p parameters, in the order of the columns of `root` and `error_root`.
+
+        As 'joint_offset.JOINT', 'registration.SENSOR.rx', 'marker.MARKER.x', 'joint_term.0.0'.
+        """
         joints = self.chain.joint_names
         origins = (*joints, 'tool')
         names = [f'joint_offset.{joint}' for joint in joints]
@@ -413,15 +441,16 @@ class ArmModel:
         return tuple(names)
 
     def registration(self, sensor: str) -> tuple[slice, slice]:
-        """Slices of the shift and the rotation of a sensor's registration in the parameters.
+        """Slices of the parameters with shift (3) and rotation vector (3) of a sensor's pose.
 
-        Raises ValueError for an unknown sensor.
+        The pose is T_R_N, of the sensor frame N in the robot base frame R. Raises ValueError
+        for an unknown sensor.
         """
         start = self.joints + 6 * list(self.T_R_N).index(sensor)
         return slice(start, start + 3), slice(start + 3, start + 6)
 
     def marker(self, marker: str) -> slice:
-        """Slice of a marker's position in the parameters; ValueError for an unknown name."""
+        """Slice of the parameters with a marker's position (3); ValueError for an unknown name."""
         start = self.joints + 6 * len(self.T_R_N) + 3 * list(self.markers).index(marker)
         return slice(start, start + 3)
 
@@ -454,7 +483,10 @@ class ArmModel:
 
     @cached_property
     def parameter_means(self) -> FloatArray:
-        """Values of the parameters, (p,); 0 for registrations, which are steps from `T_R_N`."""
+        """Values of the parameters, (p,), in the order of `parameter_names`.
+
+        0 for registrations, whose parameters are steps from `T_R_N`.
+        """
         parts = [
             self.joint_offsets,
             np.zeros(6 * len(self.T_R_N)),
@@ -470,9 +502,10 @@ class ArmModel:
         return np.concatenate(parts)
 
     def with_step(self, step: FloatArray) -> ArmModel:
-        """Model with a step (p,), in the order of `parameter_names`, added to its parameters.
+        """Return a new model whose parameters are these plus a step (p,), as `parameter_names`.
 
-        Registrations are moved by it in R: T_R_N becomes step T_R_N.
+        The pose T_R_N of a sensor is moved in the robot base frame R by shift and rotation
+        vector: T_R_N becomes step T_R_N.
         """
         k, at = self.joints, 0
 
@@ -510,10 +543,11 @@ class ArmModel:
         )
 
     def derivative(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Derivative of a marker's position by the parameters, (n, 3, p), m per unit.
+        """Derivative of a marker's position by all p parameters, (n, 3, p), m per unit.
 
-        The position is in R as the registration of ``sensor`` has it: a shift of the sensor counts
-        as the opposite shift of the arm.
+        In the robot base frame R, relative to what ``sensor`` measures: a shift of the sensor
+        counts as the opposite shift of the arm; columns of other sensors and markers are 0.
+        Raises KeyError for an unknown marker.
         """
         n, k, drivers = len(state.angles), self.joints, state.drivers
         points = apply(state.tool, self.markers[marker])
@@ -550,11 +584,11 @@ class ArmModel:
         return np.concatenate(parts, axis=2)
 
     def _base_frame(self, drivers: Drivers) -> FloatArray:
-        """Pose of the base with its turn, (n, 4, 4), in R."""
+        """Pose in the robot base frame R of the base, turned by all base terms, (n, 4, 4)."""
         return transform(rotation_vector_to_matrix(self._base_turn(drivers)), np.zeros(3))
 
     def in_sensor(self, state: State, sensor: str, marker: str) -> FloatArray:
-        """Position of a marker in the frame N of a sensor, m, (n, 3), without noise.
+        """Predicted position of a marker in the frame N of a sensor, m, (n, 3), without noise.
 
         Raises KeyError for an unknown sensor or marker.
         """
@@ -568,8 +602,9 @@ _UNITS = {'gravity_moment': '(N m)', 'temperature': 'K'}
 def unit_of(function: Function, chain: SerialChain, unit_of_sum: str = 'rad') -> str:
     """Unit of a function's coefficients, such as 'rad/(N m)' or 'rad/K'.
 
-    ``unit_of_sum``: unit of the quantity to which they add, and of all but linear and quadratic
-    functions.
+    ``unit_of_sum``: unit of the quantity to which the function is added. Coefficients of
+    linear and quadratic functions have it per unit of the driver (or its square), all others
+    have it as it is.
     """
     if function.form not in ('linear', 'quadratic'):
         return unit_of_sum
@@ -582,5 +617,9 @@ def unit_of(function: Function, chain: SerialChain, unit_of_sum: str = 'rad') ->
 
 
 def _displacements(axes: FloatArray, arms: FloatArray) -> FloatArray:
-    """Displacements of arms (n, 3) per radian about the columns of rotations (n, 3, 3)."""
+    """Displacement of points per radian of rotation about each of three axes, m, (n, 3, 3).
+
+    ``axes``: the axes as columns, (n, 3, 3) or (1, 3, 3); ``arms``: vectors from the axes to
+    the points, m, (n, 3). Column j belongs to axis j.
+    """
     return np.swapaxes(np.cross(np.swapaxes(axes, -1, -2), arms[:, None, :]), -1, -2)

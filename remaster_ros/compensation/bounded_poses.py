@@ -39,14 +39,18 @@ def nearest(
     bounds: tuple[FloatArray, FloatArray],
     avoided: FloatArray | None = None,
 ) -> FloatArray:
-    """Changes x of n rows with the least pose error, (n, k).
+    """Joint changes x of n rows with the least squared pose error, within bounds, (n, k).
+
+    A small regularisation prefers the smallest of equally good changes. A row ends when its
+    steps converge or no longer reduce the cost, or after `MOST_STEPS`.
 
     Parameters
     ----------
     errors
-        Function of changes and row indices that returns pose errors and Jacobians.
+        Function of changes (m, k) and row indices (m,) that returns pose errors, (m, 6), and
+        Jacobians, (m, 6, k), of these rows.
     start
-        Initial changes, within the bounds, (n, k).
+        Initial changes, within the bounds, (n, k); not changed.
     bounds
         Least and largest change of each joint, (n, k) each.
     avoided
@@ -105,11 +109,11 @@ def box_minimum(
     start: FloatArray,
     bounds: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Minimum of x'Hx / 2 - l'x of each row within bounds, (n, k).
+    """Point x at which x'Hx / 2 - l'x is least within bounds, for each of n rows, (n, k).
 
     ``hessian``: H, positive definite, (n, k, k); ``linear``: l, (n, k); ``start``: within the
-    bounds, (n, k); ``bounds``: least and largest x, (n, k) each. A row that needs more than 8 k
-    changes of the active set keeps its last value, within the bounds.
+    bounds, (n, k); ``bounds``: least and largest x, (n, k) each. A row that needs more than 8
+    k changes of the active set keeps its last value, within the bounds.
     """
     low, high = bounds
     k = linear.shape[1]

@@ -29,7 +29,7 @@ TABLE_LIMIT = 1_000_000
 
 @dataclass(frozen=True, eq=False)
 class CheckVisits:
-    """Configurations of a check in the order of the visits, and the changes that it can find."""
+    """Configurations that a check of an arm visits, in order, and the changes that it can find."""
 
     chain: SerialChain
     q: FloatArray  # rad, m for prismatic joints, (n, k)
@@ -39,19 +39,22 @@ class CheckVisits:
     detectable_m: FloatArray
 
     def table(self) -> str:
-        """CSV text of the table with a header, in degrees (sliding: mm), 6 decimals."""
+        """CSV text: header and a row per configuration, degrees (prismatic: mm), 6 decimals."""
         lines = [','.join(columns_of(self.chain))]
         shown = self.chain.shown_scale * self.q
         lines += [','.join(f'{value:.6f}' for value in row) for row in shown]
         return '\n'.join(lines) + '\n'
 
     def seconds(self, travel: TravelTime) -> float:
-        """Time from the settling before the first reading to the last reading, s."""
+        """Duration of a check, s: moves between the configurations, and measuring at each.
+
+        The move to the first one is not counted.
+        """
         ways = sum(float(travel.straight(a, b[None])[0]) for a, b in zip(self.q, self.q[1:]))
         return ways + len(self.q) * travel.measuring_s
 
     def too_long(self, seconds: float) -> str:
-        """Remedy if a check takes over 90 s (`CHECK_S`), a clause; '' if it does not."""
+        """Clause with the remedy if ``seconds``, of a check, are over 90 (`CHECK_S`); else ''."""
         if seconds <= CHECK_S:
             return ''
         return (
@@ -60,7 +63,10 @@ class CheckVisits:
         )
 
     def expected(self) -> list[str]:
-        """Smallest change of each joint that one check finds, mm at the tool, a line each."""
+        """Line for each joint: name, and smallest change that one check finds, mm at the tool.
+
+        Or 'none', if a moved sensor would have the same effect.
+        """
         return [
             f'{name}: '
             + ('none: looks like a sensor that was moved' if np.isnan(m) else f'{1e3 * m:.2f} mm')
@@ -75,10 +81,14 @@ def chosen_visits(
     travel: TravelTime | None,
     rng: np.random.Generator,
 ) -> CheckVisits:
-    """Choose the configurations of a check, ordered by travel time from one to the next.
+    """Choose the configurations of a check, each followed by the one that is reached soonest.
 
     Parameters
     ----------
+    cell
+        Workcell whose sensor ``aim_at`` measures its marker, with the noise stated there.
+    chain
+        Nominal arm.
     q
         Candidate configurations, rad or m, (c, k), c >= `CHECK_POSES`.
     travel
@@ -112,7 +122,8 @@ def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
     Raises
     ------
     InputError
-        No such file, a table of another arm, or a row that is not finite or outside the limits.
+        No such file, no text, or too large; a table of another arm, or not of `CHECK_POSES`
+        configurations; a row without k numbers, not finite, or outside the limits.
     """
     try:
         text = read_limited(

@@ -70,7 +70,7 @@ NAMING_ODDS = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """Readings of one check: n readings of k joints."""
+    """Readings of one check of an arm: n marker positions, each with the reported joints."""
 
     q: FloatArray  # Reported joints, rad, m for prismatic joints, (n, k)
     # Names of sensor and marker of each reading, (n,)
@@ -80,7 +80,7 @@ class Measured:
     when_s: float = np.nan  # Unix time of the check, s; NaN if unknown
 
     def merged(self, chain: SerialChain) -> Measured:
-        """Mean reading of each pose, by sensor and marker, in order of first reading."""
+        """Return a copy with one mean reading per pose, sensor and marker, by first occurrence."""
         rows: list[int] = []
         for row in range(len(self.q)):
             same = [
@@ -97,12 +97,14 @@ class Measured:
         return self.as_before(first, chain)
 
     def as_before(self, first: Measured, chain: SerialChain) -> Measured:
-        """Readings of the poses of the first check, averaged, in its order.
+        """Return a copy with the mean readings at the poses of the first check, in its order.
+
+        ``first``: the first check, merged. Readings at other poses are left out.
 
         Raises
         ------
         InputError
-            A pose of the first check is missing.
+            No reading of a pose of the first check by the same sensor and marker.
         """
         rows = []
         for i, (sensor, marker) in enumerate(zip(first.sensor, first.marker, strict=True)):
@@ -124,9 +126,9 @@ class Measured:
 
 
 def is_same_pose(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolArray:
-    """Mask of the configurations (n, k) that belong to the pose of one configuration (k,), (n,).
+    """Mask of the configurations q (n, k) within 0.5 degrees of one configuration (k,), (n,).
 
-    All joints within 0.5 degrees (`SAME_RAD`), for a slide that times ``per_radian``.
+    In every joint (`SAME_RAD`); for a prismatic joint that angle times ``per_radian``.
     """
     difference: FloatArray = np.abs(q - place) / chain.per_radian
     return np.asarray(difference.max(axis=1) <= SAME_RAD)
@@ -134,7 +136,7 @@ def is_same_pose(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolAr
 
 @dataclass(frozen=True, eq=False)
 class CheckResiduals:
-    """Residuals of a check after the sensors' registrations are fitted."""
+    """Residuals of a check after the sensors' poses are fitted; effects of joints and markers."""
 
     residuals: FloatArray  # Errors that a moved sensor cannot explain, m, (3 n,)
     # Effect on the residuals of a radian (metre) of each joint, (3 n, k), and of a metre of each
@@ -152,7 +154,7 @@ def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
     """Residuals of a check against the correction's model, with the sensors registered again.
 
     Raises InsufficientDataError if there are too few poses to register the sensors, or fewer
-    numbers are left than joints.
+    degrees of freedom are left than the arm has joints.
     """
     n, k = measured.q.shape
     state = model.state(measured.q)
@@ -211,9 +213,10 @@ def rigid_motions(points: FloatArray) -> FloatArray:
 def detectable_m(joints: FloatArray, lever_m: FloatArray, noise_m: float) -> FloatArray:
     """Smallest change of each joint that one check finds, m at the tool, (k,).
 
-    Found in 95 % of cases at 1 % of false alarms (`POWER_STD`). NaN if a moved sensor has the same
-    effect. ``joints``: effects, (3 n, k); ``lever_m``: as in `CheckResiduals`; ``noise_m``: per
-    axis.
+    Found in 95 % of cases at 1 % of false alarms (`POWER_STD`). NaN if a moved sensor has the
+    same effect. ``joints``: effects of a radian of each joint on the readings, as in
+    `CheckResiduals`, m, (3 n, k); ``lever_m``: as there, (k,); ``noise_m``: of a reading per
+    axis, m.
     """
     information = np.sum(joints**2, axis=0)
     is_seen = _is_seen(joints, lever_m)
@@ -223,9 +226,10 @@ def detectable_m(joints: FloatArray, lever_m: FloatArray, noise_m: float) -> Flo
 
 
 def _is_seen(joints: FloatArray, lever_m: FloatArray) -> BoolArray:
-    """Mask of the joints whose effect a moved sensor does not have, (k,).
+    """Mask of the joints whose effect differs from that of a moved sensor, (k,).
 
-    At least 0.001 of their motion remains (`LEAST_VISIBLE`).
+    At least 0.001 of the joint's motion of the markers remains after the sensors are fitted
+    (`LEAST_VISIBLE`). ``joints``, ``lever_m``: as in `CheckResiduals`.
     """
     found: BoolArray = np.sum(joints**2, axis=0) > LEAST_VISIBLE**2 * lever_m**2 * (
         len(joints) / 3
@@ -235,7 +239,7 @@ def _is_seen(joints: FloatArray, lever_m: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the mean of a series of T results."""
+    """Likeliest step of the mean of a series of T results: size, place, uncertainty, evidence."""
 
     evidence: float  # Value of the e-process
     at: int  # Index of the first result after the likeliest change; 0 if there is none to name
@@ -247,12 +251,12 @@ class Change:
 
 
 def bayes_factors(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Odds for a change at each place of a series, its size, and the scatter that remains.
+    """Bayes factors for a step of the mean at each place of a series, against no step.
 
-    Both means and the variance are integrated out under their invariant priors; the size of the
-    change has a normal prior of `PRIOR_STD` standard deviations of a result. ``x``: series, (…,
-    T), T >= 2. Returns odds, size and sum of squared residuals, (…, T - 1) each, for a change
-    before result 1, 2, ….
+    Both means and the variance are integrated out under their invariant priors; the size of
+    the step has a normal prior of `PRIOR_STD` standard deviations of a result. ``x``: series,
+    (…, T), T >= 2. Returns the factors, the sizes of the steps, and the sums of squared
+    residuals about the two means, (…, T - 1) each, for a step before result 1, 2, ….
     """
     T = x.shape[-1]
     j = np.arange(1.0, T)
@@ -270,9 +274,10 @@ def bayes_factors(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def evidence(x: FloatArray) -> FloatArray:
-    """E-process of series (…, T): mean of the odds for a change over all places, (…).
+    """Evidence (e-process) for a step of the mean of series (…, T), against no step, (…).
 
-    The place has the prior 1 / (j (j + 1)); 1 / T remains for a change in the future.
+    Mean of the Bayes factors over all places j, which have the prior 1 / (j (j + 1)); 1 / T
+    remains for a step in the future. 1 for fewer than two results.
     """
     T = x.shape[-1]
     if T < 2:
@@ -283,9 +288,10 @@ def evidence(x: FloatArray) -> FloatArray:
 
 
 def change(x: FloatArray) -> Change:
-    """Likeliest change of the mean of a series (T,), T >= 1.
+    """Likeliest step of the mean of a series (T,), T >= 1, with the evidence for any step.
 
-    One result has no change: its value is the size. Spreads are infinite for fewer than three.
+    For one result: its value is the size, the evidence is 1. Standard deviation and half
+    interval are infinite for fewer than three results.
     """
     T = len(x)
     if T < 2:
@@ -302,7 +308,7 @@ def change(x: FloatArray) -> Change:
 
 
 def step(x: FloatArray, at: int) -> tuple[float, float]:
-    """Change of the mean of a series (T,) before result ``at`` (1 to T - 1), and its std.
+    """Mean of a series (T,) from result ``at`` (1 to T - 1) on less that before, and its std.
 
     The std is infinite for two results.
     """
@@ -314,11 +320,11 @@ def step(x: FloatArray, at: int) -> tuple[float, float]:
 
 
 def wander(x: FloatArray, at: int) -> float:
-    """Half of the 95 % interval of a change before result ``at``, by the series' autocorrelation.
+    """Half of the 95 % interval of the size of a step before result ``at``, with autocorrelation.
 
-    Means of consecutive results differ by more than their scatter predicts if days resemble one
-    another or there is a season: batch means, of a sixth of the series at most. 0 if there are
-    fewer than six batches (`BATCHES`).
+    Means of consecutive results differ by more than their scatter predicts if days resemble
+    one another or there is a season: batch means, of a sixth of the series at most. 0 if there
+    are fewer than six batches (`BATCHES`).
     """
     T = len(x)
     deviations = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
@@ -334,9 +340,10 @@ def wander(x: FloatArray, at: int) -> float:
 
 @dataclass(frozen=True)
 class JointCheck:
-    """Result of the checks for one joint.
+    """Change of one joint by all checks so far, with its uncertainty and the evidence.
 
-    Angles in rad, m for a prismatic joint, at the tool in m.
+    Change, std: rad, or m for a prismatic joint; the detectable change: m at the tool; the
+    lever: m per rad.
 
     The change is that since the check that is named, or that of the newest check. If a moved
     sensor has the same effect, all but the lever is NaN, and the evidence is 1.
@@ -351,7 +358,7 @@ class JointCheck:
 
 @dataclass(frozen=True)
 class Trend:
-    """A change that is certain, but not certainly larger than what matters."""
+    """Drift or step that is certain, but not certainly larger than what matters."""
 
     kind: Literal['drift', 'step']
     joints: tuple[int, ...]  # Indices of the joints that may have changed
@@ -366,7 +373,7 @@ class Trend:
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of all checks of an arm so far."""
+    """Verdict of all checks of an arm so far, with the change of each joint."""
 
     verdict: Verdict  # Verdict after the newest check
     evidence: float  # Mean of the e-process over joints and markers
@@ -395,7 +402,7 @@ class CheckResult:
 def judge(
     model: ArmModel, checks: Sequence[Measured], smallest_m: float = SMALLEST_M
 ) -> CheckResult:
-    """Verdict on the newest of an arm's checks.
+    """Compare an arm's checks, and decide whether the arm, a marker or a sensor has changed.
 
     Raises InsufficientDataError if a check has too few poses (`seen`).
 
@@ -404,7 +411,8 @@ def judge(
     model
         Model of the correction.
     checks
-        Checks of the same poses, oldest first, at least one; see `Measured.as_before`.
+        Checks of the same poses in the same order, oldest first, at least one; see
+        `Measured.as_before`.
     smallest_m
         Smallest change at the tool that matters, m.
     """
@@ -525,9 +533,10 @@ def judge(
 
 
 def _days(checks: Sequence[Measured]) -> tuple[FloatArray, bool]:
-    """Times of the checks, days since the first, (T,), and whether they are known.
+    """Times of the checks, days since the first, (T,), and True; if not all are known, 0, 1, 2, ….
 
-    If a time is missing, or is not later than the one before, the checks are numbered instead.
+    If a time is missing, or is not later than the one before, the checks are numbered instead,
+    and the second value is False.
     """
     when = np.array([check.when_s for check in checks])
     if np.isfinite(when).all() and np.all(np.diff(when) > 0.0):
@@ -536,9 +545,9 @@ def _days(checks: Sequence[Measured]) -> tuple[FloatArray, bool]:
 
 
 def _before_and_after(T: int, at: int) -> FloatArray:
-    """Weights (T,) whose sum with results is their mean from `at` on less that before `at`.
+    """Weights (T,) that give the mean of results from ``at`` on less the mean of those before.
 
-    For ``at`` 0 the mean of all.
+    For ``at`` 0: the mean of all.
     """
     weights = np.full(T, 1.0 / (T - at))
     weights[:at] = -1.0 / at if at else 0.0
@@ -546,9 +555,10 @@ def _before_and_after(T: int, at: int) -> FloatArray:
 
 
 def _scatter(values: FloatArray, days: FloatArray, at: int) -> float:
-    """Standard deviation of results (T,) or (T, n) about drifts that begin at check ``at``.
+    """Standard deviation of results (T,) or (T, n) about a constant with a ramp from ``at`` on.
 
-    For more than one series it is the root of the sum of their variances; T > 2.
+    The ramp is fitted over ``days``, the times, (T,), T > 2. For n series: the root of the sum
+    of their variances.
     """
     line = np.maximum(0.0, days - days[at])
     basis = np.linalg.qr(np.stack((np.ones(len(days)), line), axis=1))[0]
@@ -562,7 +572,7 @@ def _length(weights: FloatArray) -> float:
 
 
 def _projected(check: CheckResiduals, taken: FloatArray) -> CheckResiduals:
-    """Copy of a check's residuals and effects, projected orthogonally to columns (3 n, c)."""
+    """Copy of a check with residuals and effects orthogonal to the columns ``taken``, (3 n, c)."""
     basis = np.linalg.qr(taken)[0]
 
     def projected(columns: FloatArray) -> FloatArray:
@@ -577,7 +587,11 @@ def _projected(check: CheckResiduals, taken: FloatArray) -> CheckResiduals:
 
 
 def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
-    """Change at the tool of each joint alone, and of each marker, m, (T, k + 3 m)."""
+    """Size of a change of each joint, and of each marker, in each of T checks, m, (T, k + 3 m).
+
+    By least squares: of a joint as if it alone had changed, m at the tool; of the m markers,
+    all together, x, y and z of each.
+    """
     rows = [
         (
             *(_single_column_sizes(check.joints, check.residuals) * check.lever_m),
@@ -589,7 +603,7 @@ def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
 
 
 def _single_column_sizes(columns: FloatArray, residuals: FloatArray) -> FloatArray:
-    """Least-squares size of each column (n, k) in residuals (n,) by itself, (k,).
+    """Least-squares coefficient of each column (n, k) fitted by itself to residuals (n,), (k,).
 
     0 for a column of rounding errors: its square is below 1e-18 of the largest.
     """
@@ -623,11 +637,12 @@ def _moved(
     residuals_of_checks: int,
     smallest_m: float,
 ) -> tuple[float, bool]:
-    """RMS displacement of the markers by the sensors' registration, m, and whether they moved.
+    """RMS displacement of the markers, m, that new sensor poses make, and whether sensors moved.
 
     Moved: more than ``smallest_m`` and than noise explains at 5 standard deviations
-    (`BEYOND_STD`). ``before``: earlier registrations; ``residuals_of_checks``: number of checks
-    that give the noise.
+    (`BEYOND_STD`). ``before``: earlier T_R_N by sensor; a sensor without one counts as
+    unmoved; ``last``: newest check, with its readings ``measured``; ``noise``: of a reading
+    per axis, m; ``residuals_of_checks``: number of checks that give the noise.
     """
     shift = np.zeros_like(measured.position)
     for sensor, T in last.T_R_N.items():
@@ -654,9 +669,10 @@ def _is_doubtful(
 ) -> bool:
     """Whether these checks, without an alarm, require another check.
 
-    Evidence above 10 (`DOUBT`) for a change that may matter, or a newest result that is outlying.
-    ``x_m``: series, (T, …); ``counts``: mask of the series that count; ``is_seen``: of joints,
-    (k,).
+    Evidence above 10 (`DOUBT`) for a change that may matter, or a newest check that is
+    outlying (`_is_outlying`). ``x_m``: sizes of changes as of `_series`, (T, k + 3 m);
+    ``counts``: mask of those to consider; ``is_seen``: mask of joints that sensors cannot
+    imitate, (k,); ``smallest_m``: smallest change at the tool that matters, m.
     """
     found = [change(x_m[:, i]) for i in np.flatnonzero(counts)]
     best = max(found, key=lambda estimate: estimate.evidence)
@@ -671,9 +687,9 @@ def _is_outlying(
     counts: BoolArray,
     is_seen: BoolArray,
 ) -> bool:
-    """Whether the newest result is far from those before, or the first from the correction.
+    """Whether the newest check is over 5 standard deviations (`BEYOND_STD`) from those before.
 
-    Far: beyond 5 standard deviations (`BEYOND_STD`).
+    The only check: from the correction's model. Arguments as of `_is_doubtful`.
     """
     last, T = residuals_of_checks[-1], len(residuals_of_checks)
     if T > 3:
@@ -714,8 +730,10 @@ def _changed_joints(
 ) -> tuple[tuple[int, ...], bool]:
     """Indices of the joints that may have changed, and whether a marker may have moved instead.
 
-    All explanations within odds of 20 of the best (`NAMING_ODDS`). ``weights``: (T,); the change
-    of the readings is the sum of weights times checks.
+    All explanations by one joint, or the markers, within odds of 20 of the best
+    (`NAMING_ODDS`). ``weights``: (T,), the change of the readings is the sum of weights times
+    checks; ``noise``: of a reading per axis, m; ``is_seen``: mask of joints that sensors
+    cannot imitate, (k,).
     """
     step = weights @ np.array([entry.residuals for entry in residuals_of_checks])
     variance = noise**2 * float(weights @ weights)
@@ -740,13 +758,14 @@ def chosen_poses(
 ) -> tuple[FloatArray, FloatArray]:
     """Choose the configurations in which the smallest change of any joint is seen best.
 
-    Configurations are exchanged one by one as long as the least information on a joint, divided by
-    the square of its lever, grows. ``q``: candidates, rad, (c, k), c >= count; ``sensor, marker``:
-    names of the measuring sensor and of its marker; ``count``: number of configurations; ``rng``:
-    draws the initial ones, in five tries.
+    Configurations are exchanged one by one as long as the least information on a joint,
+    divided by the square of its lever, grows. ``q``: candidates, rad, (c, k), c >= count;
+    ``sensor, marker``: names of the measuring sensor and of its marker; ``count``: number of
+    configurations; ``rng``: draws the initial ones, in five tries.
 
-    Returns the chosen rows of `q`, (count,), and the smallest change of each joint that is found
-    with a noise of 1 m per axis, m at the tool, (k,), NaN if a moved sensor has the same effect.
+    Returns the indices of the chosen rows of `q`, ascending, (count,), and the smallest change
+    of each joint that is found with a noise of 1 m per axis, m at the tool, (k,), NaN if a
+    moved sensor has the same effect.
     """
     k = q.shape[1]
     state = model.state(q)

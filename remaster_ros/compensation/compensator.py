@@ -41,7 +41,7 @@ CORRECTED = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Corrected commands for n rows of wanted joint angles."""
+    """Corrected joint commands for n rows of wanted angles, and the errors that they leave."""
 
     command: FloatArray  # Joint angles to command, rad, (n, k)
     # Remaining position and orientation error of the tool, if the model is right, (n,)
@@ -53,7 +53,7 @@ class Correction:
 
 
 class Compensator:
-    """A correction that is ready to use.
+    """Computes corrected joint commands of a calibrated arm, and the inverse.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Compensator:
 
     @cached_property
     def weights(self) -> FloatArray:
-        """Weights of a metre and a radian in a pose error, (6,): 1 / lever, then 0.05.
+        """Weights of the components of a pose error, (6,): 1 / lever for m, 0.05 for rad.
 
         The lever is the largest displacement of the tip per radian of a joint, m.
         """
@@ -80,9 +80,10 @@ class Compensator:
         return np.repeat((1.0 / lever, TOOL_SIZE), 3)
 
     def angle_errors(self, q: FloatArray, warming: FloatArray | None = None) -> FloatArray:
-        """Change to be added to q, (n, k), to remove errors of the joint angles alone, rad or m.
+        """Change of angles q (n, k) that removes the joint angles' errors alone, (n, k).
 
-        ``warming``: temperature above the reference, K, (n,); by default that of the model's mean.
+        rad or m; lengths, tilts and the base are not corrected. ``warming``: temperature above
+        the reference, K, (n,); None for that of the model's mean temperature.
         """
         warming = self.model.warming(len(q), None) if warming is None else warming
         command = q
@@ -109,13 +110,19 @@ class Compensator:
         -------
         ndarray
             rad, (..., k).
+
+        Raises
+        ------
+        ValueError
+            ``q`` has a wrong shape, or a number of it is not finite.
         """
         return self._rows(lambda rows, warm: self._solved(rows, warm)[0], q, temperature_c)
 
     def true(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Joint angles at which the nominal robot has its tool where the arm has it.
+        """Joint angles at which the nominal robot has its tool where the arm has it, (..., k).
 
-        The inverse of `command`: ``true(command(q))`` is q, wherever a pose is corrected in full.
+        The inverse of `command`: ``true(command(q))`` is q, wherever a pose is corrected in
+        full. Raises ValueError for a wrong shape or numbers that are not finite.
 
         Parameters
         ----------
@@ -127,8 +134,8 @@ class Compensator:
     def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
         """Commands (n, k), remaining errors, and rows out of range, for wanted angles (n, k).
 
-        ``temperature_c``: as in `command`. Raises ValueError for another shape or numbers that are
-        not finite.
+        ``temperature_c``: °C, one or (n,); None for the mean of the measurements. Raises
+        ValueError for another shape or numbers that are not finite.
         """
         wanted = self._checked(q).reshape(-1, self.model.joints)
         warming = self.model.warming(len(wanted), _given(temperature_c))
@@ -138,19 +145,21 @@ class Compensator:
         return self.correction(command, error)
 
     def correction(self, command: FloatArray, error: FloatArray) -> Correction:
-        """Correction for commands (n, k) and the pose errors that remain, m and rad, (n, 6).
+        """Commands that are corrected, with what they leave of the pose errors.
 
-        Incomplete: over 1e-5 m or rad (`CORRECTED`) is left.
+        ``command``: corrected joint angles, rad or m, (n, k); ``error``: of the tool after it,
+        shift, m, and rotation vector, rad, (n, 6). A row is incomplete if more than 1e-5 m or
+        rad (`CORRECTED`) is left.
         """
         shift, turn = (np.linalg.norm(part, axis=1) for part in np.split(error, 2, axis=1))
         incomplete = np.maximum(shift, turn) > CORRECTED
         return Correction(command, shift, turn, incomplete, self.model.outside(command))
 
     def tool(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> FloatArray:
-        """Pose of the tool at reported joint angles (..., k), T_R_T, (..., 4, 4).
+        """Pose T_R_T of the calibrated arm's tool at reported joint angles (..., k), (..., 4, 4).
 
-        ``temperature_c``: as in `command`. Raises ValueError for another shape or numbers that are
-        not finite.
+        ``temperature_c``: as in `command`. Raises ValueError for another shape or numbers that
+        are not finite.
         """
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
@@ -164,13 +173,13 @@ class Compensator:
         marker: str | None = None,
         temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Mean square error of the marker's position, m², (..., 3, 3), along axes of R.
+        """Mean square error of the marker's position, m², (..., 3, 3), along axes of the base R.
 
-        The error is that in the frame of the sensor, at wanted joint angles after correction, with
-        the base frame and tool of the file: it contains the uncertainty of offsets, causes,
-        registration and marker, widened as poses that were left out have shown, and the errors
-        that the command leaves. If only zero-offsets are corrected, it contains lengths and tilts
-        that stay nominal.
+        The error is that in the frame of the sensor, at wanted joint angles after correction,
+        with the base frame and tool of the file: it contains the uncertainty of offsets,
+        causes, registration and marker, widened as poses that were left out have shown, and
+        the errors that the command leaves. If only zero-offsets are corrected, it contains
+        lengths and tilts that stay nominal.
 
         Parameters
         ----------
@@ -193,10 +202,11 @@ class Compensator:
         marker: str | None = None,
         temperature_c: ArrayLike | None = None,
     ) -> FloatArray:
-        """Factor L, (..., 3, r), with L L' the second moments of all rows; see `uncertainty`.
+        """Square root L, m, (..., 3, r), of the mean square error of `uncertainty`, which is L L'.
 
-        A column is the effect of one uncertain quantity on each row; the last one is the error
-        that the commands leave.
+        A column is the effect of one uncertain quantity on the position in each row, so that
+        the errors of different rows can be combined; the last one is the error that the
+        commands leave. Arguments as of `uncertainty`.
         """
         model = self.model
         q = self._checked(q)
@@ -221,9 +231,10 @@ class Compensator:
         q: ArrayLike,
         temperature_c: ArrayLike | None,
     ) -> FloatArray:
-        """Result of a function of rows (n, k) and warming (n,), for angles (..., k), in blocks.
+        """Results of a function of rows (n, k) and warming, K, (n,), for angles (..., k).
 
-        Raises ValueError for another shape or numbers that are not finite.
+        In the shape of q; computed in blocks of rows. Raises ValueError for a wrong shape or
+        numbers that are not finite.
         """
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
@@ -243,7 +254,7 @@ class Compensator:
         return np.broadcast_to(np.asarray(given, dtype=float), q.shape[:-1]).reshape(-1)
 
     def _checked(self, q: ArrayLike) -> FloatArray:
-        """Angles as an array.
+        """Joint angles as an array of floats, (..., k).
 
         Raises ValueError for a wrong shape or numbers that are not finite.
         """
@@ -255,9 +266,11 @@ class Compensator:
         return q
 
     def _solved(self, wanted: FloatArray, warming: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Commands (n, k) and remaining pose errors, m and rad, (n, 6).
+        """Commands (n, k), and the pose errors that they leave, m and rad, (n, 6).
 
-        No joint is changed by more than ``most_rad``, or its own error if that is larger.
+        ``wanted``: joint angles, (n, k); ``warming``: temperature above the reference, K,
+        (n,). No joint is changed by more than ``most_rad``, or its own error if that is
+        larger.
         """
         problem = PoseProblem(self, wanted, warming)
         budget = problem.budget
@@ -265,7 +278,10 @@ class Compensator:
         return wanted + self.model.chain.per_radian * change, problem.remaining_error(change)
 
     def problem(self, q: FloatArray, temperature_c: float | None = None) -> PoseProblem:
-        """Problem of pose errors at wanted angles (n, k), with air at ``temperature_c``, °C."""
+        """Pose errors at wanted angles q, (n, k), as a function of joint changes.
+
+        ``temperature_c``: of the arm, °C; None for the mean of the measurements.
+        """
         return PoseProblem(self, q, self.model.warming(len(q), temperature_c))
 
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
@@ -286,11 +302,12 @@ class Compensator:
         bounds: tuple[FloatArray, FloatArray],
         start: FloatArray,
     ) -> FloatArray:
-        """Nominal robot's angles minus reported angles, within bounds, rad or m, (n, k).
+        """Nominal robot's minus reported angles for the same tool pose, within bounds, (n, k).
 
-        ``reported``: joint angles, rad, (n, k); ``warming``: K, (n,); ``bounds``: least and
-        largest difference, rad or `SerialChain.per_radian`, (n, k) each; ``start``: initial
-        difference within the bounds, (n, k).
+        rad or m. If no pose within the bounds is the same, the nearest one. ``reported``:
+        joint angles, rad, (n, k); ``warming``: temperature above the reference, K, (n,);
+        ``bounds``: least and largest difference, in rad or `SerialChain.per_radian`, (n, k)
+        each; ``start``: initial difference within the bounds, in that unit, (n, k).
         """
         model, unit, weights = self.model, self.model.chain.per_radian, self.weights
         state = model._state(model.drivers(reported, warming))
@@ -308,9 +325,11 @@ class Compensator:
         return unit * nearest(errors, start, bounds, idle)
 
     def jacobian(self, frames: FloatArray, tool: FloatArray) -> FloatArray:
-        """Derivative of a tool pose in R, m and rad, by each joint, (n, 6, k).
+        """Geometric Jacobian of the tool, shift, m, then rotation, rad, (n, 6, k).
 
-        A prismatic joint counts by `SerialChain.per_radian`.
+        Along axes of the robot base frame R, per radian of each joint, or per
+        `SerialChain.per_radian` if prismatic. ``frames``: of the joints in R, (n, k, 4, 4);
+        ``tool``: pose of the tool in R, (n, 4, 4).
         """
         chain = self.model.chain
         axes = chain.axes_in_base(frames) * ~chain.slides[:, None]
@@ -336,7 +355,10 @@ class PoseProblem:
         self.budget = np.maximum(compensator.most_rad, np.abs(self.angle_change))
 
     def of_rows(self, change: FloatArray, rows: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Weighted errors (m, 6) and Jacobians (m, 6, k) of rows (m,) at changes (m, k)."""
+        """Weighted errors (m, 6) and Jacobians (m, 6, k) of poses at joint changes (m, k).
+
+        ``rows``: indices (m,) of the wanted angles that are changed.
+        """
         model, weights = self._model, self._compensator.weights
         command = self.wanted[rows] + model.chain.per_radian * change
         state = model._state(model.drivers(command, self._warming[rows]))
@@ -348,14 +370,15 @@ class PoseProblem:
         return self.of_rows(change, np.arange(len(self.wanted)))
 
     def remaining_error(self, change: FloatArray) -> FloatArray:
-        """Error of each pose after a change, m and rad, (n, 6)."""
+        """Pose error after a change (n, k), unweighted: shift, m, rotation, rad, (n, 6)."""
         return self.errors(change)[0] / self._compensator.weights
 
 
 def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
-    """Poses (n, 4, 4) relative to their targets, along axes of R, m and rad, (n, 6).
+    """Error of poses ``reached`` against their targets, (n, 4, 4) each, m and rad, (n, 6).
 
-    Shift of the origin, then rotation vector.
+    Shift of the origin, then rotation vector from the target to the pose reached, along axes
+    of the robot base frame R.
     """
     turn = reached[:, :3, :3] @ np.swapaxes(target[:, :3, :3], 1, 2)
     shift = reached[:, :3, 3] - target[:, :3, 3]
@@ -363,7 +386,7 @@ def _pose_error(target: FloatArray, reached: FloatArray) -> FloatArray:
 
 
 def _blocks(rows: int) -> list[slice]:
-    """Slices of at most `BLOCK_ROWS` rows."""
+    """Consecutive slices of at most `BLOCK_ROWS` rows that cover this number of rows; [] for 0."""
     return [slice(start, start + BLOCK_ROWS) for start in range(0, rows, BLOCK_ROWS)]
 
 

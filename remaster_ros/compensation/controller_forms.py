@@ -97,7 +97,7 @@ TURNS = ('theta', 'alpha', 'beta', 'roll', 'pitch', 'yaw')
 
 @dataclass(frozen=True)
 class Part:
-    """One part of a correction that a form does not hold: RMS displacement of the marker, mm."""
+    """Part of a correction that an export form cannot hold, and its RMS size at the marker, mm."""
 
     what: str
     rms_mm: float
@@ -105,7 +105,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class HeldByForm:
-    """Content of a correction that a form can hold, and the error of leaving out the rest."""
+    """Content of a correction that an export form can hold, and the error that remains."""
 
     model: ArmModel  # The nominal arm with this content
     parts: tuple[Part, ...]  # Parts that the form does not hold
@@ -117,7 +117,10 @@ class HeldByForm:
 
     @property
     def words(self) -> list[str]:
-        """The errors that remain, a line each."""
+        """Lines for the user on what is left out: total error, parts, uncorrectable effects.
+
+        Parts of less than 0.005 mm RMS are only counted.
+        """
 
         def of_joints(joints: Sequence[int]) -> str:
             several = 's' if len(joints) > 1 else ''
@@ -143,10 +146,11 @@ class HeldByForm:
 
 
 def form_content(compensation: Compensation, form: Form, rng: np.random.Generator) -> HeldByForm:
-    """Content of a correction that a form can hold, fitted to the whole correction.
+    """Content of a correction that an export form can hold, fitted to the whole correction.
 
-    Compared at 400 configurations of the measured range, drawn by ``rng``; base and marker are
-    fitted with it.
+    Both are compared at 400 configurations of the measured range, drawn by ``rng``, by the
+    position of the first marker in the first sensor; base and marker are fitted with the
+    content.
     """
     model, content = compensation.model, compensation.content
     # A UR's kinematics file has no place for what carries the arm.
@@ -219,13 +223,13 @@ def form_content(compensation: Compensation, form: Form, rng: np.random.Generato
 
 
 def _of_geometry(name: str) -> str:
-    """Joint (or 'tool') of a geometry parameter; '' for other parameters."""
+    """Name of the joint, or 'tool', in a parameter's name 'geometry.JOINT.AXIS'; else ''."""
     kind, _, axis_name = name.partition('.')
     return axis_name.rpartition('.')[0] if kind == 'geometry' else ''
 
 
 def _models_without_parts(model: ArmModel, form: Form) -> list[tuple[str, ArmModel]]:
-    """Names of the parts that a form does not hold, each with the whole model without it."""
+    """For each part that a form does not hold: its name, and the whole model without this part."""
     names, none = model.chain.joint_names, Geometry.none(model.joints)
     found = []
     for effect, joint in dict.fromkeys((term.effect, term.joint) for term in model.joint_terms):
@@ -269,16 +273,17 @@ def exported(
     driver_param: bool = False,
     motors: Mapping[str, MotorNumber] | None = None,
 ) -> dict[str, str]:
-    """Files of a form, name -> text.
+    """Files of an export form, name -> text; nothing is written to the disk.
 
     Parameters
     ----------
     compensation, form
         Correction and form.
     held_content
-        Content that the form can hold.
+        Content that the form can hold, of `form_content`.
     base
-        Path and text of the file that is changed; None for the nominal URDF.
+        For ``ur``, ``rising`` and ``ros2_control``: path and text of the file that is changed;
+        None for the nominal URDF.
     driver_param
         For ``ros2_control``: ``<param name="offset">`` in place of transmissions.
     motors
@@ -287,7 +292,8 @@ def exported(
     Raises
     ------
     InputError
-        The file to be changed is not of this arm, or lacks the elements to be changed.
+        The file to be changed is not of this arm, cannot be read, or lacks the elements to be
+        changed; or ``ur`` without ``base``.
     """
     offsets = _offsets(compensation, held_content)
     notes = written_notes(offsets, held_content.words)
@@ -339,7 +345,10 @@ def exported(
 
 
 def _offsets(compensation: Compensation, held_content: HeldByForm) -> ZeroOffsets:
-    """Zero-offsets in a form, with standard deviations of the whole and remarks."""
+    """Zero-offsets in a form, with the standard deviations of the whole correction and checks.
+
+    The checks are the correction's notes 'CHECK FIRST', and the accuracy option that was on.
+    """
     content, model = compensation.content, compensation.model
     was = content.state.get('accuracy_option', '')
     option = [f"Measured with the maker's accuracy option {was}: right in that state alone."]
@@ -385,8 +394,9 @@ def _ur_yaml(
 ) -> str:
     """Text of a UR's kinematics file with the origins of the corrected robot model.
 
-    ``path``, ``text``: the arm's own file. Raises InputError if it is no such file, or its origins
-    are off those of the measured robot by over 1e-6.
+    Joints that slide are left out. ``path``, ``text``: the arm's own file, which is not
+    changed. Raises InputError if it is no such file, or its origins are off those of the
+    measured robot by over 1e-6 m or rad.
     """
     try:
         content = load_yaml(text)
@@ -441,7 +451,7 @@ def _ur_yaml(
 
 
 def _joints(urdf: str) -> list[Any]:
-    """Joints of a URDF that have a child link."""
+    """Joints of a URDF's text that have a child link."""
     return list(parse_urdf(urdf).parent_joint.values())
 
 
@@ -504,7 +514,7 @@ def _driver_params(root: ElementTree.Element, by_joint: Mapping[str, float], pat
 
 
 def _number(text: str, path: Path, joint: str) -> float:
-    """Finite number in an element. Raises InputError for other text."""
+    """Finite number in the text of an element. Raises InputError for any other text."""
     try:
         value = float(text)
     except ValueError:
@@ -517,7 +527,7 @@ def _number(text: str, path: Path, joint: str) -> float:
 
 
 def _json(compensation: Compensation, held_content: HeldByForm) -> str:
-    """Text of kinematics.json: robot, steps of each table, what is left out, and rows."""
+    """Text of kinematics.json: robot, meaning of the tables, what is left out, and their rows."""
     robot = compensation.content.robot
     content = {
         'format': KINEMATICS_FORMAT,
@@ -545,7 +555,7 @@ def _json(compensation: Compensation, held_content: HeldByForm) -> str:
 
 
 def _csv(held_content: HeldByForm) -> str:
-    """Text of kinematics.csv: the rows of the tables below a header, a joint or frame each."""
+    """Text of kinematics.csv: a header, and a row for each number of `tables`."""
     text = io.StringIO()
     writer = csv_writer(text, lineterminator='\n')
     rows = [asdict(row) for row in tables(held_content.model)]
@@ -556,7 +566,7 @@ def _csv(held_content: HeldByForm) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """One number of a table of constant geometry."""
+    """One number of a table of constant geometry: its nominal value and its change."""
 
     table: str  # ``dh``, ``hayati`` or ``poe``
     part: str  # A joint, ``base``, ``end`` or ``home``
@@ -567,10 +577,10 @@ class Row:
 
 
 def tables(model: ArmModel) -> list[Row]:
-    """Numbers of all tables of constant geometry for an arm without terms, nominal and change.
+    """Denavit-Hartenberg and screw parameters of an arm without terms: nominal values and changes.
 
-    First DH (Hayati's for parallel axes), base to end, then the screws; changes of angles are
-    within ±π.
+    First DH (Hayati's for parallel axes), base to end, then the screws and the home pose;
+    changes of angles are within ±π.
     """
     names = model.chain.joint_names
     nominal = ArmModel.nominal(model.chain)
@@ -598,7 +608,7 @@ def tables(model: ArmModel) -> list[Row]:
 
 
 class _Axes:
-    """Axes of the joints in R at reported zero, and poses of base and tool."""
+    """Axes of an arm's joints in the base frame R at reported joints 0; poses of base and tool."""
 
     def __init__(self, model: ArmModel) -> None:
         state = model.state(np.zeros((1, model.joints)))
@@ -615,9 +625,10 @@ class _Axes:
 def _dh(
     axes: _Axes, parallel: Sequence[bool], names: Sequence[str]
 ) -> list[tuple[str, str, dict[str, float]]]:
-    """Denavit-Hartenberg parameters as rows of table, part and values, base to end.
+    """Denavit-Hartenberg parameters, base to end: rows of table, part (joint or frame), values.
 
-    ``parallel``: whether the axes of each joint and the next are, (k - 1,); there Hayati's.
+    ``parallel``: whether the axes of each joint and the next are parallel, (k - 1,); such a
+    joint has Hayati's parameters, and the table 'hayati'.
     """
     frame = axes.base
     rows = [('dh', 'base', _placed(frame))]
@@ -653,10 +664,11 @@ def _dh(
 
 
 def _poe(axes: _Axes, names: Sequence[str]) -> list[tuple[str, str, dict[str, float]]]:
-    """Screws of the joints and home pose as rows of table, part (joint or 'home') and values.
+    """Product of exponentials: rows of the joints' screws and of the tool's home pose.
 
-    A screw is wx … wz, vx … vz, its rotation axis and velocity of the base's origin, m; a home
-    pose as in `_placed`.
+    A row: table 'poe', the joint's name or 'home', values. A screw is wx wy wz, vx vy vz in
+    the base frame R: rotation axis, and velocity of the point at R's origin, m/rad; of a joint
+    that slides w is 0 and v its axis. Home: x y z, m, and roll pitch yaw, rad.
     """
     rows = []
     for name, w, point, slides in zip(names, axes.along, axes.points, axes.slides, strict=True):

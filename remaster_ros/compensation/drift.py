@@ -29,7 +29,7 @@ LONGEST_DAYS = 30.0
 
 @dataclass(frozen=True)
 class Drift:
-    """A line in a series of T results, from one result on."""
+    """Drift in a series of T results, constant up to one of them and then a line."""
 
     evidence: float  # Value of the e-process over all drifts
     at: int  # Index of the first check of the likeliest line
@@ -41,7 +41,10 @@ class Drift:
     weights: FloatArray  # The size is the sum of weights times results, (T,)
 
     def days_left(self, smallest: float) -> float:
-        """Days until a drift of the largest likely slope reaches ``smallest`` (m); at least 0."""
+        """Days until the drift reaches the size ``smallest``, m, if it goes on; at least 0.
+
+        Its slope is taken as large as the 95 % interval allows.
+        """
         slope = (abs(self.size) + self.half) / self.days
         return max(0.0, (smallest - abs(self.size)) / slope)
 
@@ -49,8 +52,8 @@ class Drift:
 def drift(x: FloatArray, days: FloatArray) -> Drift:
     """Likeliest drift in a series (T,) at ascending times ``days`` (T,), and the evidence for any.
 
-    Without three results, or at a single time: evidence 1, size 0. The half interval is infinite
-    for three results.
+    Without three results, or at a single time: evidence 1, size 0. The half interval is
+    infinite for three results or fewer.
     """
     T = len(x)
     none = Drift(1.0, 0, 0.0, np.inf, 0.0, np.zeros(T))
@@ -94,10 +97,11 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
 
 
 def _interval_of_batches(residuals: FloatArray, weights: FloatArray) -> float:
-    """Half of the 95 % interval of a drift, from the autocorrelation of its residuals (T,).
+    """Half of the 95 % interval of a drift's size, from the autocorrelation of its residuals (T,).
 
-    Means of consecutive residuals, of a sixth of the series at most: if days resemble one another,
-    they differ by more than their scatter predicts. 0 for fewer than six results.
+    Means of consecutive residuals, of a sixth of the series at most: if days resemble one
+    another, they differ by more than their scatter predicts. ``weights``: (T,), the size is
+    their sum with the results. 0 for fewer than six results.
     """
     T = len(residuals)
     size = T // BATCHES

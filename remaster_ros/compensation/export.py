@@ -54,7 +54,7 @@ _PAD = """\
 
 @dataclass(frozen=True, eq=False)
 class ZeroOffsets:
-    """Zero-offsets of k joints as they are written for a controller."""
+    """Zero-offsets of k joints, with what is needed to write them for a controller."""
 
     # The nominal robot: text of its URDF, and its joints
     urdf: str
@@ -70,7 +70,7 @@ class ZeroOffsets:
 
     @classmethod
     def of(cls, result: FitResult, std: FloatArray | None = None) -> ZeroOffsets:
-        """Zero-offsets of a fit; ``std`` (k,) replaces its standard deviations."""
+        """Zero-offsets of a fit; ``std``, (k,), rad or m, replaces its standard deviations."""
         return cls(
             result.session.urdf,
             result.chain,
@@ -118,7 +118,7 @@ def exports(
 
 
 def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str]:
-    """Remarks and warnings for the user of a file, a line each."""
+    """Lines for the user of a file: remarks, names of the pad, checks, and joints left out."""
     words = [] if offsets.controller is None else pad_in_words(offsets.controller)
     return [
         *remarks,
@@ -146,9 +146,10 @@ def check_first(result: FitResult) -> list[str]:
 def remaster_text(
     offsets: ZeroOffsets, remarks: Sequence[str] = (), *, is_single_file: bool = False
 ) -> str:
-    """Instructions for re-mastering on the robot's pad, in the pad's numbers.
+    """Instructions for re-mastering on the robot's pad (teach pendant), in the pad's numbers.
 
-    ``is_single_file``: the text does not refer to the other files of a fit.
+    ``remarks``: further paragraphs; ``is_single_file``: the text does not refer to the other
+    files of a fit.
     """
     groups = mastering(
         offsets.controller,
@@ -221,9 +222,9 @@ def remaster_text(
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
-    """Lines of a table of joints whose pad has the names and angles of the URDF.
+    """Lines of the table of steps if the pad has the URDF's names and units and all are set to 0.
 
-    Turning joints in degrees first, then prismatic ones in mm.
+    Joints that turn in degrees first, then prismatic ones in mm.
     """
     rows = []
     for unit in ('deg', 'mm'):
@@ -242,7 +243,10 @@ def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
 
 
 def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
-    """Lines of a table of joints in the pad's names and angles, coupled joints in groups."""
+    """Lines of the table of steps in the pad's names and units, with remarks below.
+
+    ``groups``: joints that are coupled stand in one group.
+    """
     steps = [step for group in groups for step in group]
     wide = max(len('on the pad'), *(len(step.pad_name) for step in steps))
     long = max(len('in the URDF'), *(len(step.joint) for step in steps))
@@ -295,9 +299,10 @@ def _pad_rows(groups: Sequence[Sequence[MasteringStep]]) -> list[str]:
 
 
 def layer_text(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> str:
-    """Text of a ROS 2 parameter file with the offsets for an offset layer, rad or m.
+    """Text of a ROS 2 parameter file with the offsets, rad or m, for an offset layer.
 
-    Only identifiable ones; ``remarks``: comments, a line each.
+    A layer is a node between planner and controller. Only identifiable offsets; the names of
+    the others are listed. ``remarks``: comments, a line each.
     """
     slides = bool(offsets.chain.slides.any())
     head = (

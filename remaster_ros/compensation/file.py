@@ -67,7 +67,7 @@ class RobotPart(Robot):
 
 
 class SourcePart(Struct):
-    """The result from which the correction was made."""
+    """Command, version and hashes of the result from which the correction was made."""
 
     made_by: Source
     result_sha256: str
@@ -76,7 +76,7 @@ class SourcePart(Struct):
 
 
 class TermPart(Struct):
-    """A function of one driver; see `Function`."""
+    """Term of a joint or of the base in the file: a function of one driver; see `Function`."""
 
     effect: str
     driver: Driver
@@ -106,7 +106,7 @@ class JointPart(Struct, kw_only=True):
 
 
 class OriginPart(Struct):
-    """Change of the origin of a joint, or of the tool."""
+    """Change of the origin of a joint or the tool: shift, m, and rotation vector, rad."""
 
     at: str
     shift: Triple
@@ -114,7 +114,10 @@ class OriginPart(Struct):
 
 
 class GeometryPart(Struct):
-    """Shifts (m) in the frame of the link before, turns (rad) in the joint's own frame."""
+    """Constant changes of the joints' origins in the file.
+
+    Shifts, m, are in the frame of the link before; turns, rad, in the joint's own frame.
+    """
 
     frames: str
     origins: list[OriginPart]
@@ -130,7 +133,7 @@ class MassPart(Struct):
 
 
 class TemperaturePart(Struct):
-    """Growth: changes of origins per kelvin above the reference."""
+    """Growth with the temperature: changes of origins per kelvin above the reference."""
 
     reference_c: float
     measured_at_c: float
@@ -138,14 +141,14 @@ class TemperaturePart(Struct):
 
 
 class ErrorPart(Struct):
-    """Root E of the second moments E' E of the true parameters about those of the file."""
+    """Second moments E' E of the true parameters about those of the file, by their root E."""
 
     names: list[str]
     root: list[list[float]]
 
 
 class ParametersPart(Struct):
-    """Means and covariance U' U of the parameters; rows of U from its diagonal on."""
+    """Means and covariance U' U of the parameters; each row of U begins at its diagonal."""
 
     names: list[str]
     units: list[str]
@@ -156,7 +159,7 @@ class ParametersPart(Struct):
 
 
 class CompensationPart(Struct):
-    """Content of the file."""
+    """Whole content of compensation.json."""
 
     format: str
     robot: RobotPart
@@ -180,9 +183,9 @@ class CompensationPart(Struct):
     on_tool: dict[str, Mount] | UnsetType = UNSET
 
     def per_joint(self, what: str, chain: SerialChain) -> FloatArray:
-        """Offset or range of each joint, rad, m for prismatic ones, (k,) or (k, 2).
+        """Offset, (k,), or range, (k, 2), of each joint in the file, rad, m for prismatic ones.
 
-        ``what``: 'offset' or 'range'.
+        ``what``: 'offset' or 'range'; ``chain``: the file's arm.
         """
         parts = zip(self.joints, chain.units, strict=True)
         return np.array([getattr(part, f'{what}_{unit}') for part, unit in parts])
@@ -190,7 +193,7 @@ class CompensationPart(Struct):
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """A correction read from a file."""
+    """Correction of an arm that was read from compensation.json, ready to use."""
 
     path: Path
     compensator: Compensator  # The correction, ready to use
@@ -213,32 +216,33 @@ class Compensation:
     def true(self, q: Any, temperature_c: Any = None) -> FloatArray:
         """Joint angles at which the nominal robot has its tool where the arm has it, (..., k).
 
-        The inverse of `command`: ``q`` are reported angles, rad or m, (..., k). As
-        `Compensator.true`.
+        The inverse of `command`. ``q``: reported angles, rad or m, (..., k);
+        ``temperature_c``: as of `command`. Raises as `Compensator.true`.
         """
         return self.compensator.true(q, temperature_c)
 
     def uncertainty(self, q: Any) -> FloatArray:
         """Mean square error of the first marker's position in the first sensor, m², (..., 3, 3).
 
-        After correction at wanted angles ``q``, rad or m, (..., k), along axes of R. As
-        `Compensator.uncertainty`.
+        After correction at wanted angles ``q``, rad or m, (..., k), along axes of the robot
+        base frame R. As `Compensator.uncertainty`.
         """
         return self.compensator.uncertainty(q)
 
     def trajectory(
         self, times_s: Any, positions: Any, velocities: Any = None, **more: Any
     ) -> CorrectedTrajectory:
-        """Trajectory to send for a wanted one of the nominal robot.
+        """Trajectory to send to the controller for a wanted one of the nominal robot.
 
-        ``times_s``: ascending, (n,), at least two; ``positions, velocities``: wanted, (n, k).
-        Further arguments and errors as of `corrected_trajectory`.
+        ``times_s``: ascending, s, (n,), at least two; ``positions, velocities``: wanted, rad
+        and rad/s, (n, k), velocities may be None. Further arguments and errors as of
+        `corrected_trajectory`.
         """
         return corrected_trajectory(self.compensator, times_s, positions, velocities, **more)
 
 
 def written(described: CorrectedArm, session: Session, made_by: Source, result_sha256: str) -> str:
-    """Text of compensation.json.
+    """Text of compensation.json; nothing is written to the disk.
 
     Parameters
     ----------
@@ -322,9 +326,10 @@ def written(described: CorrectedArm, session: Session, made_by: Source, result_s
 
 
 def _triangle(root: FloatArray) -> tuple[list[int], list[list[float]]]:
-    """Columns of a root (r, p) that are not zero (indices), and the rows of its triangle.
+    """Columns (indices) of a root (r, p) that are not all zero, and its triangular factor there.
 
-    Each row begins at its diagonal; numbers have 10 digits.
+    Rows of the factor of their QR decomposition; each begins at its diagonal, and numbers have
+    10 digits.
     """
     kept = np.flatnonzero(np.any(root != 0.0, axis=0))
     rows = np.asarray(np.linalg.qr(root[:, kept], 'r')).tolist()
@@ -366,7 +371,10 @@ def _term(term: JointTerm | BaseTerm, chain: SerialChain) -> dict[str, Any]:
 
 
 def _origins(geometry: Geometry, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Origins of the file that are changed: name of joint or 'tool', shift, m, and turn, rad."""
+    """Changed origins as plain data: name of the joint or 'tool', shift, m, and turn, rad.
+
+    Origins without a change are left out. ``names``: of the k joints.
+    """
     rows = zip((*names, 'tool'), geometry.shifts, geometry.turns, strict=True)
     return [
         {'at': name, 'shift': shift, 'turn': turn}
@@ -376,7 +384,7 @@ def _origins(geometry: Geometry, names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def read_compensation(path: str | os.PathLike[str]) -> Compensation:
-    """Read compensation.json.
+    """Read compensation.json, with all checks.
 
     Raises
     ------
@@ -389,9 +397,9 @@ def read_compensation(path: str | os.PathLike[str]) -> Compensation:
 
 
 def of_text(data: bytes, path: Path) -> Compensation:
-    """Compensation from the text of a compensation.json; ``path`` is for messages.
+    """Compensation from the content of a compensation.json; ``path`` is for messages only.
 
-    Raises InputError as `read_compensation` does.
+    Raises InputError as `read_compensation` does: one line with the place and the remedy.
     """
     content = decoded(data, path, CompensationPart, FORMAT, REMEDY)
     try:
@@ -403,7 +411,10 @@ def of_text(data: bytes, path: Path) -> Compensation:
 
 
 def _refuse_huge(content: CompensationPart) -> None:
-    """Raise InputError for numbers above 1e9 (`LARGEST`), whose products overflow."""
+    """Raise InputError for a number above 1e9 (`LARGEST`) in size, whose products overflow.
+
+    The part 'state' is not looked at.
+    """
     for key, part in msgspec.to_builtins(content).items():
         # What the controller reported is shown, never computed with.
         for where, value in _numbers(part, key) if key != 'state' else ():
@@ -412,7 +423,10 @@ def _refuse_huge(content: CompensationPart) -> None:
 
 
 def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
-    """Yield the dotted place and the value of all numbers of a part of the file."""
+    """Yield the dotted place, as 'joints.0.offset_rad', and the value of all numbers of a part.
+
+    ``value``: plain data, nested; ``where``: place of the part itself.
+    """
     if isinstance(value, int | float):
         yield where, value
     elif not isinstance(value, str | None):
@@ -421,10 +435,10 @@ def _numbers(value: Any, where: str) -> Iterator[tuple[str, float]]:
 
 
 def _model(content: CompensationPart) -> ArmModel:
-    """Model of the arm in a file.
+    """Model of the arm in the content of a file.
 
     Raises InputError for contents that contradict each other, or whose correction does not
-    converge (slope of 1 or more).
+    converge (`ArmModel.largest_slope` of 1 or more).
     """
     robot = content.robot
     if hashlib.sha256(robot.urdf.encode()).hexdigest() != robot.urdf_sha256:
@@ -517,10 +531,11 @@ def _model(content: CompensationPart) -> ArmModel:
 def _root(
     model: ArmModel, part: str, names: Sequence[str], key: str, rows: Sequence[Sequence[float]]
 ) -> FloatArray:
-    """Matrix of all parameters, (r, p), from the rows of an upper triangle of the named ones.
+    """Matrix over all p parameters, (r, p), from an upper triangle over the named ones.
 
-    ``part``, ``key``: for messages. Raises InputError for unknown or repeated names, or rows of
-    other lengths.
+    ``rows``: of the triangle, each from its diagonal on; parameters that are not named have 0.
+    ``part``, ``key``: for messages. Raises InputError for unknown or repeated names, or rows
+    of other lengths.
     """
     order = {name: i for i, name in enumerate(model.parameter_names)}
     strangers = [name for name in names if name not in order]
@@ -540,10 +555,11 @@ def _root(
 def _function(
     part: TermPart, where: str, chain: SerialChain, axes: int
 ) -> tuple[Function, FloatArray]:
-    """Function and coefficients (m,) of a term of the file.
+    """Function of a term of the file, and its coefficients, (m times ``axes``,).
 
-    ``where``: its place, for messages; ``axes``: number of coefficients for each feature. Raises
-    InputError for contents that contradict each other.
+    ``where``: its place, for messages; ``axes``: number of coefficients for each of the m
+    features, 1 of a joint, 3 of the base. Raises InputError for contents that contradict each
+    other.
     """
     joint, names = -1, chain.joint_names
     if part.driver in ('angle', 'gravity_torque'):
@@ -599,5 +615,5 @@ def _geometry(origins: Sequence[OriginPart], names: Sequence[str]) -> Geometry:
 
 
 def _broken(where: str, what: str) -> InputError:
-    """InputError on a part of the file: place and what is wrong, with the remedy."""
+    """Return an InputError on a part of the file: its place and what is wrong, with the remedy."""
     return InputError(f'{where} {what}; write the file again with fit or discover')

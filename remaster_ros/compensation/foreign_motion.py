@@ -88,9 +88,9 @@ class SentTrajectory:
     end: tuple[FloatArray, FloatArray] | None = None
 
     def samples(self, since_s: float, until_s: float) -> FloatArray:
-        """Positions on the path between two times from its start, rad, (33, k).
+        """Positions on the path at 33 evenly spaced times between two times, rad, (33, k).
 
-        Evenly spaced in time; beyond the ends of the path its ends.
+        The times, s, count from the path's start; before and after the path its ends hold.
         """
         waypoints = self.admitted.waypoints
         times = np.array([0.0, *(point.time_s for point in waypoints)])
@@ -113,10 +113,10 @@ class ArmReports:
         self._still_rad = SettleRules().still_tolerance
 
     def take(self, stamp_s: float, q: FloatArray, wall_s: float) -> None:
-        """Add a report: its stamp, positions, rad, (k,), and the wall time of its arrival.
+        """Add a report: its stamp, s, positions, rad, (k,), and the wall time of its arrival, s.
 
-        A report with the stamp of the one before is ignored. An earlier stamp clears all reports
-        before, since a clock was set back.
+        A report with the stamp of the one before is ignored. An earlier stamp clears all
+        reports before, since a clock was set back.
         """
         reports = self._reports
         if reports and stamp_s == reports[-1][0]:
@@ -129,18 +129,18 @@ class ArmReports:
         self._wall_s = wall_s
 
     def snapshot(self) -> ArmReports:
-        """Copy of the reports for another thread."""
+        """Copy of the reports for another thread; later reports do not change it."""
         taken = ArmReports()
         taken._reports, taken._wall_s = self._reports.copy(), self._wall_s
         return taken
 
     def is_fresh(self, wall_s: float) -> bool:
-        """Whether the last report came within `FRESH_S`, 0.25 s, before a wall time, s."""
+        """Whether the last report came at most 0.25 s (`FRESH_S`) before a wall time, s."""
         return wall_s - self._wall_s <= FRESH_S
 
     @property
     def q(self) -> FloatArray:
-        """Last reported position, rad or m, (k,); there must be a report."""
+        """Last reported position, rad or m, (k,); IndexError before the first report."""
         return self._reports[-1][1]
 
     @property
@@ -152,7 +152,7 @@ class ArmReports:
     def velocity(self) -> FloatArray:
         """Velocity by the last two reports, rad/s or m/s, (k,): exactly 0 if the arm stands.
 
-        There must be two reports (`is_known`).
+        There must be two reports (`is_known`), else IndexError.
         """
         if self.stands:
             return np.zeros_like(self.q)
@@ -161,7 +161,10 @@ class ArmReports:
 
     @property
     def stands(self) -> bool:
-        """Whether the arm has stood for `following.STANDING_S`; False if not reported."""
+        """Whether the reports of the last `following.STANDING_S` differ by no more than noise.
+
+        False if the reports do not reach back so long.
+        """
         reports = self._reports
         if not reports or reports[-1][0] - reports[0][0] < STANDING_S:
             return False
@@ -169,11 +172,12 @@ class ArmReports:
 
 
 class TrueAngles:
-    """Angles of the nominal arm with its tool where the arm has it, report by report.
+    """Joint angles at which the nominal arm's tool is where the real arm has it, report by report.
 
-    They are continuous from report to report: near singularities, where several solutions exist,
-    the branch is kept while the arm moves. When the arm comes to rest at the end of a trajectory,
-    they are the angles that the planner wanted there. ``compensator``: the correction.
+    They are continuous from report to report: near singularities, where several solutions
+    exist, the branch is kept while the arm moves. When the arm comes to rest at the end of a
+    trajectory, they are the angles that the planner wanted there. ``compensator``: the
+    correction.
     """
 
     def __init__(self, compensator: Compensator) -> None:
@@ -190,16 +194,18 @@ class TrueAngles:
     def lead(self, passed: SentTrajectory) -> None:
         """Note the trajectory that is sent: at its end the planner expects its wanted angles.
 
-        The branch that was followed is forgotten.
+        The end of the trajectory before is forgotten. The correction is computed again even if
+        the arm stands.
         """
         self._end, self._is_known = passed.end, False
 
     def at(self, q: FloatArray, temperature_c: float | None, now_s: float) -> FloatArray:
-        """Nominal arm's angles for reported angles, rad, (k,).
+        """Nominal arm's angles for reported angles q, rad, (k,); ``now_s``: present time, s.
 
-        The correction is computed at most every `EVERY_S` while the arm moves, and until it is
-        known where the arm stands; it changes by `ADDED_RAD_S` at most. Between computations it is
-        off by the way in that time times the slope of the correction.
+        The correction is computed at most every `EVERY_S` while the arm moves, and after it
+        stands until it no longer changes; its rate of change is `ADDED_RAD_S` at most. Between
+        computations it is off by the way in that time times the slope of the correction.
+        ``temperature_c``: of the arm, None for the mean of the measurements.
         """
         if self._at is None:
             self.added, self._is_known = self._compensator.true(q, temperature_c) - q, True
@@ -286,14 +292,17 @@ def _passed(
     notes: list[str],
     end: tuple[FloatArray, FloatArray] | None = None,
 ) -> SentTrajectory:
-    """Trajectory to send, with the state of the arm at its computation."""
+    """Return the trajectory to send, with the arm's position, velocity and rest at present.
+
+    ``end``: command at its end and wanted angles there, rad, (k,); None if the arm is held.
+    """
     return SentTrajectory(admitted, end_s, arm.q, arm.velocity, arm.stands, tuple(notes), end)
 
 
 def _refuse_bad_numbers(wanted: Trajectory) -> None:
     """Raise InputError for numbers that are not finite, or times that do not ascend from 0 on.
 
-    Also for a trajectory of over an hour (`LONGEST_S`).
+    Also if it takes over an hour (`LONGEST_S`). ``wanted``: at least one point.
     """
     t, q, v = wanted.times_s, wanted.positions, wanted.velocities
     if not all(np.all(np.isfinite(values)) for values in (t, q, v) if values is not None):
@@ -307,9 +316,11 @@ def _refuse_bad_numbers(wanted: Trajectory) -> None:
 def _refuse_too_fast(
     t: FloatArray, q: FloatArray, v: FloatArray | None, limits: MotionLimits
 ) -> None:
-    """Raise InputError if the planner's own speeds exceed the limits by over 1 %.
+    """Raise InputError if a planner's trajectory exceeds a joint's velocity limit by over 1 %.
 
-    Only ours are slowed down.
+    It is not slowed down: that is done only for speed that the correction adds. ``t``: s,
+    (n,); ``q``: rad, (n, k); ``v``: rad/s, (n, k), cubics between points; None for straight
+    lines.
     """
     largest = largest_speeds(t, q, v)
     if np.any(largest > limits.velocity * (1.0 + SPEED_TOLERANCE)):
@@ -375,7 +386,10 @@ def _corrected(
 
 
 def _refuse_too_large(correction: CorrectionInUse, change: FloatArray) -> None:
-    """Raise InputError if a row of the changes (n, k) is too large for a joint."""
+    """Raise InputError if a row of the changes, rad, (n, k), is larger than the correction allows.
+
+    The message is that of the first such row (`CorrectionInUse.too_large`).
+    """
     refused = correction.too_large(change)
     if refused:
         raise InputError(next(iter(refused.values())))

@@ -38,7 +38,7 @@ SEED = 22
 
 @dataclass(frozen=True, eq=False)
 class Commands:
-    """Commands for n wanted configurations."""
+    """Corrected commands for n wanted configurations, and why some must not be commanded."""
 
     # Command, and its difference from the wanted angles, rad, (n, k); the command of a refused row
     # is NaN
@@ -75,7 +75,8 @@ class CorrectionInUse:
     Raises
     ------
     InputError
-        One line: no such file, of another arm, or larger than `most_deg`.
+        One line: no such file, of another arm, of an arm with a prismatic joint, or larger than
+        `most_deg`.
     """
 
     def __init__(
@@ -122,14 +123,17 @@ class CorrectionInUse:
 
     @cached_property
     def true_arm(self) -> SerialChain:
-        """The arm with zero-offsets, lengths and tilts built in; it takes reported angles."""
+        """Serial chain with zero-offsets, lengths and tilts built in, which takes reported angles.
+
+        As `ArmModel.rigid`: without terms and compliance.
+        """
         return self.compensator.model.rigid()
 
     @cached_property
     def _bends(self) -> FloatArray:
-        """Rotation at each joint that `true_arm` lacks, rad, (n, k).
+        """Angle between each joint's frame in the full model and in `true_arm`, rad, (2000, k).
 
-        In the n sampled configurations.
+        Of the rotation relative to the joint before, at each sampled configuration.
         """
         frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
@@ -159,9 +163,10 @@ class CorrectionInUse:
 
     @cached_property
     def shifts(self) -> FloatArray:
-        """Least and largest sum to be added to reported angles, rad or m, (2, k).
+        """Least and largest sum of zero-offset and terms of each joint, rad or m, (2, k).
 
-        Over the sampled configurations, at the temperature of the measurements.
+        To be added to reported angles. Over the sampled configurations, at the mean
+        temperature of the measurements.
         """
         model = self.compensator.model
         drivers = model.drivers(self._sampled, model.warming(len(self._sampled), None))
@@ -170,7 +175,10 @@ class CorrectionInUse:
 
     @property
     def remarks(self) -> list[str]:
-        """Remarks for the person who puts the correction in use, a line each."""
+        """Remarks for the person who puts the correction in use, a line each; [] if none.
+
+        On a dependence on the temperature, and on another correction that must still be on.
+        """
         lines = []
         model, state = self.compensator.model, self._compensation.content.state
         if model.grows:
@@ -187,9 +195,9 @@ class CorrectionInUse:
         return lines
 
     def too_large(self, change: FloatArray) -> dict[int, str]:
-        """Reason for each row (index) of changes (n, k), rad, that changes a joint by too much.
+        """Reason for each row (index) of changes, rad, (n, k), with a joint beyond ``most_deg``.
 
-        Too much: beyond ``most_deg``; {} if none does.
+        {} if no row does.
         """
         refused = {}
         most = np.abs(change).max(axis=1, initial=0.0)
@@ -203,19 +211,21 @@ class CorrectionInUse:
         return refused
 
     def for_waypoints(self, waypoints: FloatArray) -> tuple[FloatArray, dict[int, str]]:
-        """Commands for waypoints, rad, (n, k), and the reason for each row that is refused.
+        """Commands for waypoints, rad, (n, k), and the reason for each refused row (index).
 
-        The true joint angles are those of the planned way, so that the arm keeps to it. Waypoints
-        need no exact tool pose, so that near a singularity no joint moves further than its own
-        error. The command of a refused row is returned all the same.
+        Only errors of the joint angles are corrected, so that the arm keeps to the planned
+        path and near a singularity no joint moves further than its own error; the tool's pose
+        is not exact. A row is refused if a joint would be changed by over ``most_deg``; its
+        command is returned all the same.
         """
         change = self.compensator.angle_errors(waypoints)
         return waypoints + change, self.too_large(change)
 
     def commands(self, wanted: FloatArray) -> Commands:
-        """Commands for wanted configurations, rad, (n, k); rows that are not finite are refused.
+        """Commands for wanted configurations, rad, (n, k), whose tool poses are corrected.
 
-        Also rows in which a joint would be changed by over ``most_deg``.
+        Refused rows, whose command is NaN: those that are not finite, and those in which a
+        joint would be changed by over ``most_deg``.
         """
         finite = np.all(np.isfinite(wanted), axis=-1)
         done = self.compensator.correct(np.where(finite[:, None], wanted, 0.0))
@@ -246,7 +256,7 @@ class CorrectionInUse:
 def _refuse_another_arm(
     found: Compensation, chain: SerialChain, urdf: str, urdf_file: str
 ) -> None:
-    """Raise InputError if the correction is of another URDF, other links or joints."""
+    """Raise InputError if the correction is of another URDF, other end links or other joints."""
     robot = found.content.robot
     sha256 = hashlib.sha256(urdf.encode()).hexdigest()
     if robot.urdf_sha256 != sha256:
@@ -277,7 +287,10 @@ def _sampled(chain: SerialChain) -> FloatArray:
 
 
 def _steps(frames: FloatArray) -> FloatArray:
-    """Frame of each joint in the one before, (n, k, 4, 4), from frames in R, (n, k, 4, 4)."""
+    """Pose of each joint's frame in that of the joint before, (n, k, 4, 4).
+
+    ``frames``: poses in the robot base frame R, (n, k, 4, 4); the first one stays in R.
+    """
     found: FloatArray = np.concatenate(
         (frames[:, :1], inverse(frames[:, :-1]) @ frames[:, 1:]), axis=1
     )

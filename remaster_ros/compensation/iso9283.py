@@ -25,7 +25,7 @@ CYCLES = 30
 
 @dataclass(frozen=True, eq=False)
 class IsoFigures:
-    """Accuracy and repeatability by the sensor and marker with most readings."""
+    """Position accuracy AP and repeatability RP of ISO 9283, by one sensor and marker."""
 
     # Visits of each configuration, most first, (p,). Consecutive readings are one visit.
     visits: tuple[int, ...]
@@ -35,7 +35,7 @@ class IsoFigures:
     repeatability_m: FloatArray
 
     def text(self) -> str:
-        """AP and RP at the worst pose, mm, or what is missing for them, as a sentence."""
+        """Sentence with AP and RP at the worst pose, mm, or with what is missing for them."""
         if len(self.accuracy_m):
             return (
                 f'ISO 9283, {len(self.accuracy_m)} poses of {CYCLES} visits and more: accuracy '
@@ -53,7 +53,9 @@ class IsoFigures:
 
 
 def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) -> IsoFigures:
-    """Accuracy and repeatability of repeated visits.
+    """Position accuracy and repeatability of ISO 9283 from repeated visits.
+
+    Empty arrays if fewer than 5 poses (`POSES`) have 30 visits (`CYCLES`).
 
     Parameters
     ----------
@@ -63,7 +65,8 @@ def iso_figures(model: ArmModel, measured: Measured, wanted: FloatArray | None) 
     measured
         Readings in the order in which they were taken.
     wanted
-        Joints before any correction, rad, (n, k), NaN if nothing was corrected; or None.
+        Joints before any correction, rad, (n, k), NaN if nothing was corrected; None for the
+        reported joints.
     """
     pairs = list(zip(measured.sensor, measured.marker, strict=True))
     most = max(dict.fromkeys(pairs), key=pairs.count)

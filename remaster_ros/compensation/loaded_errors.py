@@ -23,10 +23,11 @@ from remaster_ros.types import FloatArray, Measurements, Session
 
 
 def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> FloatArray:
-    """Errors (measured minus modelled) of all rows with the model of a URDF, m, (n, 3).
+    """Errors (measured minus modelled) of all rows with the arm of a URDF, m, (n, 3).
 
-    Along the axes of each row's sensor. Registrations and markers are fitted to the optimization
-    rows, except ``gross``: their ``observation``; offsets are 0. Raises as `estimate`.
+    Along the axes of each row's sensor. Sensor poses and markers are fitted to the rows of the
+    split 'optimization', without those whose ``observation`` is in ``gross``; zero-offsets are
+    those of the URDF alone. ``urdf``: its text. Raises as `estimate`.
     """
     session = replace(session, urdf=urdf)
     m = session.measurements
@@ -37,11 +38,11 @@ def errors_with_urdf(session: Session, urdf: str, gross: Sequence[int] = ()) -> 
 
 
 def errors_with_correction(model: ArmModel, measurements: Measurements) -> FloatArray:
-    """Errors of all rows with the arm of a compensation.json, m, (n, 3), in the sensors' frames.
+    """Errors (measured minus modelled) of all rows if the arm were corrected, m, (n, 3).
 
-    They contain the errors that a command leaves near singularities; nothing is fitted.
-    ``measurements`` have the model's sensors and markers by their indices; rows without a
-    temperature have the reference's.
+    In the sensors' frames, with the model of a compensation.json. They contain the errors that
+    a command leaves near singularities; nothing is fitted. ``measurements`` have the model's
+    sensors and markers by their indices; rows without a temperature have the reference's.
     """
     m = measurements
     known = np.isfinite(m.temperature_c)
@@ -58,10 +59,11 @@ def errors_with_correction(model: ArmModel, measurements: Measurements) -> Float
 
 
 def without_errors_of_measuring(fit: FitResult, parameters: slice | FloatArray) -> FloatArray:
-    """Positions of all rows minus the effect of some further parameters of a fit, m, (n, 3).
+    """Measured positions of all rows less the effect of some causes of a fit, m, (n, 3).
 
-    ``parameters``: slice or mask of the further parameters, those of measurement errors. The
-    measured positions themselves if there are none.
+    ``parameters``: slice or mask of the causes' parameters (those beyond offsets,
+    registrations and markers), of errors of the measurement. The measured positions themselves
+    if there are none.
     """
     measured = fit.session.measurements.position
     model, after = fit.predictive.model, fit.predictive.after

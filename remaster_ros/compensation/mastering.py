@@ -32,7 +32,7 @@ _STEP_MM = 10.0
 
 @dataclass(frozen=True)
 class MasteringStep:
-    """One joint to be set on the pad."""
+    """Numbers on the robot's pad (teach pendant) with which the zero of one joint is set."""
 
     joint: str  # Name in the URDF
     pad_name: str
@@ -54,7 +54,7 @@ class MasteringStep:
 
     @property
     def digits(self) -> int:
-        """Number of decimal places."""
+        """Number of decimal places with which values are shown in the pad's unit."""
         return _DIGITS[self.unit]
 
     def shown(self, value: float) -> str:
@@ -74,9 +74,9 @@ class MasteringStep:
 
     @property
     def to_set_zero(self) -> str:
-        """Position to drive to, as the pad shows it (`unit`), if the controller can only set 0.
+        """Position to drive to if the controller can only set 0, as the pad shows it, in `unit`.
 
-        The position to drive to less that to be set.
+        It is `drive_to` less `set_to`.
         """
         return self.shown(self.drive_to - self.set_to)
 
@@ -100,6 +100,11 @@ def mastering(
         Zero-offsets of the URDF's joints, rad, m for prismatic joints, (k,).
     known
         Whether the data determine them, (k,); the others stay as they are.
+
+    Raises
+    ------
+    InputError
+        ``controller`` has a sign, a zero or a coupling for a prismatic joint.
     """
     pad = PadAngles.of(controller, chain.joint_names)
     applied = np.where(known, offsets, 0.0)
@@ -150,9 +155,10 @@ def mastering(
 
 
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
-    """True positions where joints are set, rad or m, (k,): 0, or mid-range if beyond limits.
+    """True joint positions at which zeros are set, rad or m, (k,): 0, else mid-range.
 
-    Mid-range is rounded to 10 degrees or 10 mm.
+    Mid-range, rounded to 10 degrees or 10 mm, if 0 plus or minus the joint's offset, (k,), is
+    beyond its limits; those of joints that turn are cut to ±180 degrees.
     """
     turn = np.where(chain.slides, np.inf, np.pi)
     lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)
@@ -164,9 +170,9 @@ def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
 
 
 def _coupled_groups(joints: Sequence[int], pad: PadAngles) -> list[list[int]]:
-    """Groups of coupled joints (indices), each joint after those that are added to it.
+    """Groups of coupled joints (indices from 0), each joint after those that are added to it.
 
-    Sorted by the least index in each group.
+    A joint without a coupling is a group of its own. Sorted by the least index in each group.
     """
     groups: list[list[int]] = []
     for i in joints:

@@ -64,7 +64,7 @@ _NOT_TOLD = (
 
 @dataclass(frozen=True)
 class Slot:
-    """Location of some coefficients in an `ArmModel`."""
+    """Place of some coefficients in an `ArmModel`: a term, an origin or a compliance."""
 
     kind: str  # ``joint``, ``base``, ``geometry``, ``growth`` or ``lateral``
     joint: int = -1  # Index of the joint; k for the tool
@@ -84,7 +84,7 @@ class NotCorrected(Struct, frozen=True):
 
 
 class Mount(Struct, frozen=True):
-    """Sensor on the tool, as compensation.json has it: its marker; its rotation in T, if known."""
+    """Sensor on the tool, as compensation.json has it: its marker, and its rotation if known."""
 
     marker: str  # Marker at the origin of the sensor
     rotation_xyzw: Quaternion | UnsetType = UNSET
@@ -115,10 +115,11 @@ def arm_of_offsets(
 ) -> CorrectedArm:
     """Arm with the zero-offsets of a fit; offsets that are not identifiable are 0.
 
-    Registrations and markers are the most likely ones with these offsets: if only a prior
-    separates an offset from a position of the marker, leaving out the one moves the other. If
-    ``geometry`` is given (see `arm_of_geometry`), the expected error is that against the arm with
-    all lengths and tilts, since no arm is exactly its drawing.
+    Registrations (sensor poses) and markers are the most likely ones with these offsets: if
+    only a prior separates an offset from a position of the marker, leaving out the one moves
+    the other. If ``geometry`` is given (see `arm_of_geometry`), the expected error is that
+    against the arm with all lengths and tilts, since no arm is exactly its drawing.
+    ``widening``: factor on the standard deviations; ``notes``: added to those of the arm.
     """
     described = _described(fit, [], np.zeros(0), None, widening)
     model = described.model
@@ -139,10 +140,10 @@ def arm_of_offsets(
 
 
 def _second_moments_about(loaded: ArmModel, known: ArmModel) -> FloatArray:
-    """Root E, (e, p), of the second moments E' E of an arm's parameters about those loaded.
+    """Root E, (e, p), of the second moments E' E of the true parameters about those of ``loaded``.
 
-    If ``known`` is their posterior, of mean m and covariance C, the moments are C + (m - loaded)
-    (m - loaded)'.
+    ``known``: posterior of the true parameters, of mean m and covariance C, widened; the
+    moments are C + (m - loaded) (m - loaded)'.
     """
     difference = known.parameter_means - loaded.parameter_means
     for sensor, T_R_N in loaded.T_R_N.items():
@@ -159,8 +160,9 @@ def arm_of_geometry(
 ) -> CorrectedArm:
     """Arm with all lengths and tilts of a fit, and the zero-offsets that belong to them.
 
-    Its covariance is that at the mode. ``measurements`` are those that were fitted, with the
-    indices of the sensors and markers that occur in them.
+    ``geometry``: their model, fitted at its mode, whose covariance the arm has;
+    ``measurements``: those that were fitted, with the indices of the sensors and markers that
+    occur in them.
     """
     mode = geometry.mode
     posterior = mode.linearisation.posterior
@@ -185,7 +187,7 @@ def arm_of_geometry(
 def arm_of_effects(
     fit: FitResult, candidates: Sequence[Candidate], data: Residuals
 ) -> CorrectedArm:
-    """Arm of a sampled model with effects; its predictions are not widened.
+    """Arm with the effects of a discovery, from a sampled fit; its predictions are not widened.
 
     Parameters
     ----------
@@ -202,9 +204,9 @@ def arm_of_effects(
 def mounts_of(fit: FitResult, model: ArmModel) -> dict[str, Mount]:
     """Marker and rotation of each sensor on the tool, by its name, with the arm of a correction.
 
-    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are not
-    identifiable: with it the rotation is the mean that the fitted rows show. Unset if the fit has
-    none; {} without sensors on the tool.
+    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are
+    not identifiable: with it the rotation R_T_C is the mean that the fitted rows show. A
+    rotation is unset if the fit has none of that sensor; {} without sensors on the tool.
     """
     session, found, m = fit.session, fit.orientations, fit.measurements
     left_out = [observation for observation, _ in fit.left_out]
@@ -236,10 +238,11 @@ def _described(
     data: Residuals | None,
     widening: float,
 ) -> CorrectedArm:
-    """Arm of a fit with candidates and their parameters ``theta``, one after the other.
+    """Arm of a fit with the candidates and their parameters ``theta``, one after the other.
 
-    ``data``: residuals, None for no list of effects that are not corrected; ``widening``: factor
-    on standard deviations.
+    Candidates without a place in the arm are left out, and listed as not corrected, unless
+    ``data``, the residuals in which they were sought, is None. ``widening``: factor on
+    standard deviations.
     """
     chain = fit.chain
     slots: dict[Slot, int] = {}
@@ -291,12 +294,12 @@ def _described(
 def _as_predicted(
     model: ArmModel, fit: FitResult, problem: Problem, without: Sequence[slice]
 ) -> ArmModel:
-    """Arm that predicts the fitted rows as the fit does, without some parameters.
+    """Arm that predicts the fitted rows as the fit does; parameters in ``without`` count as 0.
 
-    The fit has lengths, tilts and the like to first order, about the zero-offsets that were found
-    without them; this model has them exactly. The difference is removed within the posterior's
-    uncertainty: a step C J' d / σ² with its covariance C. If the data determine everything, C is
-    (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
+    The fit has lengths, tilts and the like to first order, about the zero-offsets that were
+    found without them; this model has them exactly. The difference is removed within the
+    posterior's uncertainty: a step C J' d / σ² with its covariance C. If the data determine
+    everything, C is (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
     """
     z = fit.predictive.after.copy()
     for parameters in without:
@@ -325,9 +328,10 @@ def _as_predicted(
 
 
 def _draws(fit: FitResult) -> tuple[FloatArray, FloatArray]:
-    """Draws of offsets, registrations and markers, (draws, p), and the mean offsets, (k,).
+    """Posterior draws of offsets, registrations and markers, (draws, p); mean offsets, (k,).
 
-    Registrations are steps (shift and rotation vector) from their mean, in R.
+    Registrations are steps (shift and rotation vector) from their mean, in the robot base
+    frame R. Offsets whose mean is exactly 0 are 0 in all draws.
     """
     model, z = fit.predictive.model, fit.predictive.draws.copy()
     # Offsets that the gauge fixes are exactly zero.
@@ -352,9 +356,9 @@ def _model(
     temperatures: tuple[float, float],
     widening: float,
 ) -> ArmModel:
-    """Model with coefficients in their slots, offsets 0 and no covariance.
+    """Model of the arm with coefficients in their slots; all zero-offsets 0, no covariance.
 
-    ``temperatures``: reference and mean, °C.
+    Registrations and markers are the fit's. ``temperatures``: reference and mean, °C.
     """
     joints = len(chain)
     found = fit.predictive.model
@@ -393,7 +397,11 @@ def _model(
 def _in_order(
     model: ArmModel, slots: Mapping[Slot, int], spread: Mapping[Slot, FloatArray], count: int
 ) -> FloatArray:
-    """Draws of the further parameters in the model's order, (count, p), 0 in unused ones."""
+    """Draws of all coefficients of terms, origins and compliances, in the model's order.
+
+    (count, p), 0 for unused ones; p without offsets, registrations and markers. ``slots``:
+    number of coefficients of each; ``spread``: draws of each, (count, that number).
+    """
     joints = model.joints
     parts = [spread[slot] for slot in slots if slot.kind == 'joint']
     parts += [spread[slot] for slot in slots if slot.kind == 'base']
@@ -406,9 +414,10 @@ def _in_order(
 
 
 def _temperatures(measurements: Measurements) -> tuple[float, float]:
-    """First known temperature, as in `Context.warming`, and mean of the fitted rows, °C.
+    """First known temperature, and mean of the rows fitted, °C; NaN, NaN if none is known.
 
-    NaN without any.
+    The first one is by time, as in `Context.warming`. If no row fitted has a temperature, the
+    mean is that of all rows.
     """
     known = np.isfinite(measurements.temperature_c)
     if not known.any():
@@ -420,9 +429,10 @@ def _temperatures(measurements: Measurements) -> tuple[float, float]:
 
 
 def slots_of(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield the slots of a candidate in an `ArmModel`; nothing if it has no place there.
+    """Yield the slots of a candidate in an `ArmModel`; nothing if the arm has no place for it.
 
-    Each slot comes with the matrix from the candidate's m parameters to its coefficients.
+    Each slot comes with the matrix from the candidate's m parameters to its coefficients,
+    (coefficients, m).
     """
     if candidate.changes is not None:
         # The arm is as it was after the change.
@@ -464,7 +474,7 @@ def _of_links(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, 
 
 
 def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a base candidate; none if it has no place here."""
+    """Yield slots and matrices of a candidate that turns the base; none if it has no place."""
     if candidate.driver == 'gravity_moment' and candidate.form == 'linear':
         axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
         if candidate.variant in axes:
@@ -481,9 +491,10 @@ def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
 
 
 def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, FloatArray]]:
-    """Yield functions and matrices of a candidate; nothing for an unknown driver or form.
+    """Yield functions of a candidate, each with the matrix from its parameters to coefficients.
 
-    ``joint``: index from 0, for a driver that names none.
+    Nothing for a driver or form that no correction has. ``joint``: index from 0, for a driver
+    that names none.
     """
     if candidate.happened:
         # The arm is as it was after what happened.
@@ -513,7 +524,10 @@ def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, Flo
 
 
 def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
-    """Function of a curve as splines, and the matrix from its free heights to all coefficients."""
+    """Function of a curve as splines, and the matrix from its free heights to all coefficients.
+
+    ``joint``: index from 0 of the joint whose angle or torque drives; -1 for other drivers.
+    """
     heights = curve.heights
     if curve.closed:
         # The last splines are the first ones of the next turn.
@@ -527,9 +541,10 @@ def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatA
 def _not_corrected(
     candidates: Sequence[tuple[Candidate, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
-    """Yield the effects that are not corrected, one for the candidates of the same joints.
+    """Yield the effects that are not corrected; candidates of one name, joints and reason are one.
 
-    Effects that round to 0.000 mm RMS are left out. ``candidates``: with their slices of theta.
+    Effects that round to 0.000 mm RMS are left out. ``candidates``: with their slices of
+    ``theta``, their parameters; ``data``: residuals in which they were sought.
     """
     by_effect: dict[tuple[str, tuple[int, ...], str], FloatArray] = {}
     remedies = {}

@@ -84,7 +84,7 @@ belong to that state alone.
 
 @dataclass(frozen=True)
 class MotorNumber:
-    """A number that a controller has stored for a motor."""
+    """Number that a controller has stored for a joint's motor, and how the angle follows it."""
 
     old: float  # The stored number
     counts_per_degree: float  # Counts per degree of the joint, above 0
@@ -94,7 +94,8 @@ class MotorNumber:
 def motor_text(offsets: ZeroOffsets, motors: Mapping[str, MotorNumber]) -> str:
     """Text with the motor numbers to store: new = old + direction × counts per degree × offset.
 
-    ``motors``: by joint. Joints that slide, are coupled or not determined have the reason instead.
+    ``motors``: by joint; joints without one are left out. Joints that slide, are coupled or
+    not determined have the reason in place of a number.
     """
     pad = PadAngles.of(offsets.controller, offsets.chain.joint_names)
     shown = np.degrees(pad.offsets_on_pad(offsets.applied))

@@ -49,7 +49,7 @@ Errors = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of a corrected path; k joints, n times."""
+    """Largest acceleration, speed and change of a corrected path; k joints, n times."""
 
     acceleration: FloatArray  # Acceleration of the path with its change, rad/s², (k,)
     speed: FloatArray  # rad/s, (k,)
@@ -58,9 +58,9 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Known changes at the first and the last time, rad and rad/s, (k,) each.
+    """Known joint changes at the first and the last time of a path, and whether it rests there.
 
-    None if the change is free there.
+    Changes in rad, (k,) each; None if the change is free there.
     """
 
     first: FloatArray | None
@@ -72,7 +72,7 @@ class Ends:
 
 @dataclass(frozen=True, eq=False)
 class SmoothChanges:
-    """The correction along a path, and the weights that produced it."""
+    """Joint changes along a path, cubics over time, and the weights that produced them."""
 
     times_s: FloatArray  # Ascending, (n,)
     change: FloatArray  # At each time, rad, (n, k)
@@ -82,7 +82,7 @@ class SmoothChanges:
     pull: FloatArray
 
     def at(self, times: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Changes, rad, and speeds, rad/s, at times (m,), each (m, k), by the cubics."""
+        """Changes, rad, and their speeds, rad/s, at times (m,), s, each (m, k), by the cubics."""
         cubic = scipy.interpolate.CubicHermiteSpline(self.times_s, self.change, self.speed)
         return np.asarray(cubic(times)), np.asarray(cubic(times, 1))
 
@@ -96,12 +96,15 @@ def smooth_changes(
     ends: Ends,
     before: SmoothChanges | None = None,
 ) -> SmoothChanges:
-    """The correction along a path.
+    """Joint changes along a path that keep the tool as near to the wanted one as limits allow.
+
+    After `ROUNDS` rounds they are returned as they are, even if a limit is still exceeded.
 
     Parameters
     ----------
     errors
-        Function of changes that returns pose errors and Jacobians.
+        Function of changes (n, k) that returns weighted pose errors, (n, 6), and Jacobians,
+        (n, 6, k).
     times_s
         Ascending, (n,), n >= 2.
     angle_change
@@ -163,8 +166,8 @@ def smooth_changes(
 def accelerations(rows: FloatArray, state: FloatArray) -> FloatArray:
     """Accelerations of cubics at both ends of each interval, (n - 1, 2, k).
 
-    ``rows``: from (value, speed) before and after each interval, (n - 1, 2, 4); ``state``: values
-    and speeds, (n, 2, k).
+    ``rows``: weights of (value, speed) before and after each interval, (n - 1, 2, 4);
+    ``state``: values and speeds, (n, 2, k).
     """
     both = np.concatenate((state[:-1], state[1:]), axis=1)
     return np.asarray(np.einsum('nej,njk->nek', rows, both))
@@ -176,10 +179,11 @@ def _limit_shares(
     wanted: tuple[FloatArray, FloatArray],
     limits: Limits,
 ) -> FloatArray:
-    """Largest share of a limit that each interval takes, (n - 1,).
+    """Largest ratio of acceleration or speed to its limit in each interval, (n - 1,).
 
-    ``speed, acceleration``: of the change. Where the path passes a limit by itself, a change may
-    add `ADDED` of that.
+    ``speed``, (n, k), and ``acceleration``, (n - 1, 2, k): of the change, to which those of
+    the path, ``wanted``, are added. If the path itself exceeds a limit of acceleration, the
+    limit is the path's plus a share `ADDED` of it.
     """
     allowed = np.maximum(limits.acceleration, (1.0 + ADDED) * np.abs(wanted[0]))
     accelerated = np.max(np.abs(acceleration + wanted[0]) / allowed, axis=(1, 2))

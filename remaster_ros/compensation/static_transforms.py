@@ -54,7 +54,7 @@ class StaticTransform:
 
     @property
     def words(self) -> str:
-        """Frames and standard deviations, mm and degrees, as text."""
+        """Line of text with the two frames and the standard deviations, mm and degrees."""
         mm = ' '.join(f'{1e3 * value:.3f}' for value in self.std_m)
         degrees = ' '.join(f'{value:.4f}' for value in np.degrees(self.std_rad))
         return f'{self.parent} -> {self.child}: std x y z {mm} mm, about x y z {degrees} deg'
@@ -63,7 +63,7 @@ class StaticTransform:
 def static_transforms(
     compensation: Compensation, frames: Mapping[str, str]
 ) -> list[StaticTransform]:
-    """Transforms of every sensor of a correction.
+    """Transforms of every sensor of a correction; of one on the tool, also that of its target.
 
     Parameters
     ----------
@@ -75,8 +75,8 @@ def static_transforms(
     Raises
     ------
     InputError
-        No such sensor, a name that tf2 does not accept or that two frames have, or a sensor on the
-        tool whose rotation is unknown.
+        No such sensor, a name that tf2 does not accept or that two frames have, a sensor on the
+        tool whose rotation is unknown, or a file of a version that does not tell these.
     """
     content = compensation.content
     for sensor in frames:

@@ -45,7 +45,7 @@ SHARE_OF_STREAM = 0.9
 
 @dataclass(frozen=True, eq=False)
 class ArmNow:
-    """Current state of an arm of k joints."""
+    """Current position and velocity of an arm of k joints, reported and as the nominal robot."""
 
     q: FloatArray  # Reported, rad, (k,)
     nominal_q: FloatArray  # Angles of the nominal robot with the same tool, rad, (k,)
@@ -54,7 +54,7 @@ class ArmNow:
 
 @dataclass(frozen=True, eq=False)
 class CorrectedTrajectory:
-    """Trajectory to send: n points of k joints."""
+    """Trajectory to send, n points of k joints, and the errors that it leaves."""
 
     times_s: FloatArray  # Times from the start, (n,)
     # rad and rad/s, (n, k); velocities are None if none were given
@@ -65,7 +65,7 @@ class CorrectedTrajectory:
     # Largest distance of the tool from the wanted path at the compared places, m
     deviation_m: float
     # Increase of each joint's largest speed and acceleration before slowing down, as a share of
-    # the wanted one, (k,); 0 if the joint was to stand, NaN for accelerations of straight lines
+    # the wanted one, (k,); 0 if the joint was to stand, and for accelerations of straight lines
     added_speed: FloatArray
     added_acceleration: FloatArray
     # As in `Correction`, (n,)
@@ -86,16 +86,17 @@ def corrected_trajectory(
     temperature_c: float | None = None,
     begins: FloatArray | None = None,
 ) -> CorrectedTrajectory:
-    """Trajectory to send for a wanted trajectory of the nominal robot.
+    """Trajectory to send to the controller for a wanted trajectory of the nominal robot.
 
-    ``compensator``: the correction; ``times_s``: ascending, (n,), n >= 2; ``positions,
-    velocities``: wanted, rad and rad/s, (n, k); ``tolerance_m``: largest deviation of the tool
-    between points; ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); None for
-    those of the URDF, and for no limit; ``temperature_c``: of the arm; ``begins``: command at the
-    start, rad, (k,); None for the best command there.
+    Points are added, and time is stretched if a limit requires it. ``compensator``: the
+    correction; ``times_s``: ascending, (n,), n >= 2; ``positions, velocities``: wanted, rad
+    and rad/s, (n, k); ``tolerance_m``: largest deviation of the tool between points;
+    ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); None for those of the
+    URDF, and for no limit; ``temperature_c``: of the arm; ``begins``: command at the start,
+    rad, (k,); None for the best command there.
 
-    Raises InputError for numbers that are not finite, times that do not ascend, other shapes, or a
-    path whose correction cannot be followed with a point per millisecond.
+    Raises InputError for numbers that are not finite, times that do not ascend, other shapes,
+    or a path whose correction cannot be followed with a point per millisecond.
     """
     t, q, v = _checked(compensator, times_s, positions, velocities)
     wanted = DrawnPath(t, q, v)
@@ -170,13 +171,16 @@ class DrawnPath:
         self._cubic = None if v is None else scipy.interpolate.CubicHermiteSpline(t, q, v)
 
     def at(self, times: FloatArray) -> FloatArray:
-        """Positions at times (n,), (n, k); beyond the ends lines hold the end, cubics go on."""
+        """Positions, rad or m, at times (m,), s, (m, k).
+
+        Beyond the ends: lines hold the position of the end, cubics go on.
+        """
         if self._cubic is not None:
             return np.asarray(self._cubic(times))
         return np.stack([np.interp(times, self.t, q) for q in self.q.T], axis=1)
 
     def speed(self, times: FloatArray) -> FloatArray:
-        """Velocities, rad/s, of a cubic at times, s, (n, k); not for lines (AssertionError)."""
+        """Velocities of a cubic at times (m,), s, rad/s, (m, k); AssertionError for lines."""
         assert self._cubic is not None
         return np.asarray(self._cubic(times, 1))
 
@@ -185,7 +189,7 @@ class DrawnPath:
         return self.v is not None and not np.any(self.v[end])
 
     def accelerations(self) -> FloatArray:
-        """Accelerations at the start and the end of each interval, (n - 1, 2, k); 0 for lines."""
+        """Accelerations at both ends of each interval, rad/s², (n - 1, 2, k); 0 for lines."""
         h = np.diff(self.t)[:, None]
         if self.v is None:
             return np.zeros((len(h), 2, self.q.shape[1]))
@@ -194,7 +198,10 @@ class DrawnPath:
         return np.stack((start, (2.0 * first + 4.0 * last - 6.0 * slope) / h), axis=1)
 
     def largest(self) -> tuple[FloatArray, FloatArray]:
-        """Largest speed and acceleration of each joint, (k,) each; NaN accelerations for lines."""
+        """Largest speed and acceleration of each joint, without sign, (k,) each.
+
+        For lines the accelerations are NaN.
+        """
         h = np.diff(self.t)[:, None]
         if self.v is None:
             slope = np.diff(self.q, axis=0) / h
@@ -239,9 +246,10 @@ def _checked(
 
 
 def _sampling_times(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
-    """Times dense enough that the correction has no unseen wave between them, with those wanted.
+    """Times, s, ascending, at which the correction is computed, with those of the path's points.
 
-    Steps of 0.5 rad, or an eighth of the shortest wave; not below 1 ms.
+    Apart by at most 0.5 rad of a joint's way, or an eighth of the shortest wave of a term; but
+    not by less than 1 ms.
     """
     orders = [term.function.order for term in compensator.model.joint_terms]
     step = min(LONGEST_STEP_RAD, 2.0 * np.pi / (POINTS_OF_WAVE * max([1, *orders])))
@@ -265,11 +273,12 @@ def _allowed(
     speed_limits: FloatArray,
     acceleration_limits: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Largest speeds and accelerations of a corrected path, (k,) each.
+    """Largest speeds and accelerations of a corrected path before it is slowed down, (k,) each.
 
-    They allow for slowing down by `SLOWER`, in addition to the slowing down that the wanted path
-    itself requires. Without limits of acceleration: twice the largest of the wanted path, or of
-    joints that go over a radian at its speed.
+    ``wanted``: largest of the wanted path, (k,) each. They allow for slowing down by `SLOWER`,
+    in addition to the slowing down that the wanted path itself requires. Without limits of
+    acceleration: the path's own, plus the largest of all joints or, if more, the square of its
+    largest speed.
     """
     speed, acceleration = wanted
     slower = max(1.0, float(np.max(speed / speed_limits)))
@@ -284,9 +293,9 @@ def _allowed(
 
 
 def _knot_indices(times: FloatArray, interval_s: float) -> IntArray:
-    """Indices of ascending times at intervals of at least `interval_s`, with both ends.
+    """Indices of ascending times that are at least ``interval_s`` apart, with both ends.
 
-    The last interval may be shorter. Longer steps of the times stay as they are.
+    The last interval may be shorter. Times that are further apart are all chosen.
     """
     chosen = [0]
     last = len(times) - 1
@@ -306,11 +315,11 @@ def _corrected(
     temperature_c: float | None,
     before: SmoothChanges | None,
 ) -> tuple[DrawnPath, Correction, SmoothChanges]:
-    """Corrected path through points at given times, the correction of the points.
+    """Corrected path through points at given times, their correction, and changes at knots.
 
-    Last result: its changes at the knots. ``knots``: indices of the times at which changes are
-    sought; ``limits``: largest speeds and accelerations, (k,) each; ``before``: changes for fewer
-    times.
+    ``wanted``: the path; ``knots``: indices of the times at which changes are sought;
+    ``limits``: largest speeds and accelerations, (k,) each; ``ends``: known changes;
+    ``before``: changes for fewer times, to begin with, or None.
     """
     q = wanted.at(times)
     v = None if wanted.v is None else wanted.speed(times)
@@ -335,10 +344,11 @@ def _corrected(
 
 
 def _largest_between(accelerations: FloatArray, knots: IntArray) -> FloatArray:
-    """Largest acceleration between knots, of either sign, at both ends, (m, 2, k).
+    """Acceleration of the largest size, with its sign, between consecutive knots, (m, 2, k).
 
-    ``accelerations``: at both ends of each interval, (n, 2, k), returned unchanged where two knots
-    have a single interval between them.
+    The same at both ends of each of the m intervals between knots. ``accelerations``: at both
+    ends of each interval between times, (n, 2, k), returned unchanged if two knots have a
+    single one between them.
     """
     ends = accelerations.reshape(-1, accelerations.shape[2])
     first = 2 * knots[:-1]
@@ -357,9 +367,10 @@ def _deviation_between(
     knots: IntArray,
     temperature_c: float | None,
 ) -> FloatArray:
-    """Deviation of the tool in each interval beyond that at the knots, m, (n - 1, m).
+    """Deviation of the tool's position at places within each interval, beyond that at the knots.
 
-    The error that remains at two knots is expected to change linearly between them.
+    m, (n - 1, places). What remains at two knots is expected to change linearly between them,
+    and taken off. ``knots``: indices of the times of ``sent``.
     """
     times, share = sent.t, COMPARED[sent.v is not None]
     inside = times[:-1, None] + np.diff(times)[:, None] * np.concatenate((share, [1.0]))
@@ -382,11 +393,12 @@ def corrected_points(
     acceleration_limits: FloatArray,
     temperature_c: float | None = None,
 ) -> tuple[Correction, FloatArray | None]:
-    """Commands for the points of a moving arm, and their velocities.
+    """Commands for the points of a moving arm, and their velocities, rad/s, (n, k).
 
-    ``compensator, temperature_c, acceleration_limits``: as in `corrected_trajectory`; ``times_s``:
-    from now on, above 0, (n,); ``q, v``: wanted, rad and rad/s, (n, k), None without velocities;
-    ``now``: current state of the arm.
+    ``compensator, temperature_c``: as in `corrected_trajectory`; ``times_s``: from now on,
+    above 0, (n,); ``q, v``: wanted, rad and rad/s, (n, k); without velocities v and the
+    returned ones are None; ``now``: current state of the arm; ``acceleration_limits``: rad/s²,
+    (k,).
     """
     unit = compensator.model.chain.per_radian
     times, q = np.concatenate(([0.0], times_s)), np.concatenate((now.nominal_q[None], q))
@@ -410,5 +422,5 @@ def corrected_points(
 
 
 def _added(before: FloatArray, after: FloatArray) -> FloatArray:
-    """Relative increase of values (k,), 0 if there was none before."""
+    """Relative increase of values (k,), 0 if the value before is 0 or NaN."""
     return np.divide(after, before, out=np.ones_like(after), where=before > 0.0) - 1.0

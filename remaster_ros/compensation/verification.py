@@ -56,7 +56,7 @@ BEYOND_STD = 3.3
 
 @dataclass(frozen=True, eq=False)
 class Visits:
-    """Rows measured for wanted joint angles; n rows of k joints."""
+    """Marker positions measured at wanted joint angles, with a correction on or off, n rows."""
 
     wanted: FloatArray  # Angles of the nominal robot, rad, (n, k)
     on: BoolArray  # Whether the correction was on, (n,)
@@ -78,7 +78,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean error of the marker and its 95 % interval, mm."""
+    """Mean distance of the marker from its wanted position, and its 95 % interval, mm."""
 
     mean_mm: float
     interval95_mm: tuple[float, float]
@@ -86,7 +86,7 @@ class Mean:
 
 @dataclass(frozen=True)
 class VerificationResult:
-    """Result of a verification."""
+    """Verdict whether a correction acts, acts twice or not, with shares, errors and noise."""
 
     verdict: Verdict  # State by the absolute estimate
     toggle: Estimate | None  # None without configurations that were visited on and off
@@ -105,7 +105,7 @@ class VerificationResult:
 
 
 def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
-    """Decide whether a correction is in use.
+    """Decide whether a correction acts on an arm: once, not, twice, or with the wrong sign.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def verify(compensator: Compensator, visits: Visits) -> VerificationResult:
 
 
 class _ProjectedRows:
-    """Rows with the correction on, or off: measured and predicted positions in R."""
+    """Measured and predicted marker positions in the base frame R, with a correction on or off."""
 
     def __init__(self, compensator: Compensator, visits: Visits, rows: IntArray) -> None:
         self.compensator, self.model = compensator, compensator.model
@@ -179,21 +179,25 @@ class _ProjectedRows:
         self._complement = vectors[:, self.base_columns :]
 
     def seen(self, q: FloatArray) -> FloatArray:
-        """Positions of the markers at commanded angles (n, k), in R, m, (n, 3), by the model."""
+        """Predicted positions of the markers at commanded angles (n, k), m, (n, 3).
+
+        By the model of the corrected arm, in the robot base frame R.
+        """
         return apply(self.compensator.tool(q), self.places)
 
     def projected(self, columns: FloatArray) -> FloatArray:
-        """Part of columns (3 n, …) in R that the fit of base and markers cannot absorb.
+        """Part of position errors, m, (3 n, …), that a fit of base and markers cannot absorb.
 
-        As coordinates in an orthonormal basis of the complement of that fit.
+        ``columns``: x, y, z of each row in the robot base frame R. As coordinates in an
+        orthonormal basis of the complement of that fit, (d, …).
         """
         found: FloatArray = self._complement.T @ columns
         return found
 
     def moves(self, q: FloatArray) -> FloatArray:
-        """Displacements by a share of 1 of each joint's correction, m, (3 n, k).
+        """Displacements of the markers by the whole correction of each single joint, m, (3 n, k).
 
-        ``q``: angles at which they are linear, (n, k).
+        To first order at angles ``q``, (n, k).
         """
         change = self.command - self.wanted
         return (self._derivative(q)[:, :, : self.model.joints] * change[:, None, :]).reshape(
@@ -201,15 +205,19 @@ class _ProjectedRows:
         )
 
     def unsure(self, q: FloatArray) -> FloatArray:
-        """Displacements by one standard deviation of each uncertain parameter, m, (3 n, r).
+        """Displacements of markers by one std of each uncertain parameter, m, (3 n, r).
 
-        At commanded angles (n, k); widened as poses that were left out have shown.
+        One column for each of r independent errors of the parameters, at commanded angles
+        ``q``, (n, k); widened as poses that were left out have shown.
         """
         spread = self.model.widening * (self._derivative(q) @ self.model.root.T)
         return spread.reshape(3 * len(q), -1)
 
     def _derivative(self, q: FloatArray) -> FloatArray:
-        """Derivative of the markers' positions by the parameters, (n, 3, p)."""
+        """Derivative of the markers' positions by the p parameters at ``q``, (n, 3, p).
+
+        Shifts of sensors count as those of the first one.
+        """
         sensor, state = next(iter(self.model.T_R_N)), self.model.state(q)
         found = np.zeros((len(q), 3, len(self.model.parameter_names)))
         for marker in dict.fromkeys(self.markers):
@@ -218,15 +226,16 @@ class _ProjectedRows:
         return found
 
     def error(self) -> Mean:
-        """Mean error from the wanted positions, base and marker fitted again, mm."""
+        """Mean distance of markers from wanted positions, mm, base and markers fitted again."""
         errors = self._complement @ self.projected(self.measured - self.nominal.ravel())
         return _mean(np.linalg.norm(errors.reshape(-1, 3), axis=1))
 
 
 def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, FloatArray]:
-    """Angles that reach the joints for wanted ones (n, k) in each state, rad or m, (n, k).
+    """Angles that reach the joints for wanted ones (n, k), by state of the correction.
 
-    States: 'in_use' (the command), 'not_in_use' (wanted), 'twice' and 'wrong_sign'.
+    rad or m, (n, k). States: 'in_use' (the command), 'not_in_use' (wanted), 'twice' and
+    'wrong_sign'.
     """
     once = compensator.command(wanted)
     return {
@@ -238,14 +247,17 @@ def commands(compensator: Compensator, wanted: FloatArray) -> dict[Verdict, Floa
 
 
 def _mean(errors: FloatArray) -> Mean:
-    """Mean of errors (n,), m, and its 95 % interval, mm; infinite at the top for one error."""
+    """Mean of error lengths (n,), m, and its 95 % interval, in mm.
+
+    The interval begins at 0 at least; it is infinite at the top for one error.
+    """
     mean = float(errors.mean())
     half = 1.96 * float(errors.std(ddof=1)) / np.sqrt(len(errors)) if len(errors) > 1 else np.inf
     return Mean(1e3 * mean, (1e3 * max(0.0, mean - half), 1e3 * (mean + half)))
 
 
 def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
-    """Log density of a residual (d,) for each of `SIGMAS`.
+    """Log density of a residual (d,) for each noise level σ in `SIGMAS`, but for a constant.
 
     Its covariance is σ² plus that of standard normal coefficients of ``columns`` (d, m).
     """
@@ -264,15 +276,17 @@ def _log_likelihood(residual: FloatArray, columns: FloatArray) -> FloatArray:
 
 
 def _integrated(values: FloatArray) -> float:
-    """Logarithm of the mean likelihood over the noise `SIGMAS`, from those at each."""
+    """Logarithm of the mean likelihood over the noise levels `SIGMAS`, from log ones at each."""
     top = values.max()
     return float(top + np.log(np.mean(np.exp(values - top))))
 
 
 def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[FloatArray]]:
-    """Estimate of the whole, of each joint, and displacements of the alternatives not excluded.
+    """Estimate of the share of the whole correction that acts, that of each joint, and rivals.
 
-    An alternative (another state, or a joint in one) is excluded by odds of 1000 (`ODDS`).
+    From rows with the correction on. Rivals: displacements, projected, from the best state to
+    each alternative (another state, or one joint in another state) that odds of 1000 (`ODDS`)
+    do not exclude; with any the verdict is 'unclear'.
     """
     states, other = {}, {}
     for state, q in side.commands.items():
@@ -304,9 +318,10 @@ def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[Floa
 def _single_joint_alternatives(
     side: _ProjectedRows, best: Verdict, sigma: float, evidence: float
 ) -> list[FloatArray]:
-    """Displacements by single joints in another state that is not excluded.
+    """Projected displacements, (d,) each, by one joint in another state, if it is not excluded.
 
-    Only joints whose state the rows could tell are considered.
+    Only joints whose state the rows could tell are considered. ``best``: state of the others;
+    ``sigma``: noise of a reading per axis, m; ``evidence``: log evidence of ``best``.
     """
     unsure = side.projected(side.unsure(side.commands[best]))
     residual = side.projected(side.measured - side.at[best])
@@ -324,18 +339,20 @@ def _single_joint_alternatives(
 
 
 def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
-    """Expected log odds between two states whose predictions differ by a step, m, (3 n,).
+    """Expected log odds between two states whose predictions differ by a step, m, (d,).
 
-    ``unsure``: as of `_ProjectedRows.unsure`; ``sigma``: noise of a reading per axis, m.
+    ``unsure``: effects of uncertain parameters, (d, r), projected as the step; ``sigma``:
+    noise of a reading per axis, m.
     """
     covariance = sigma**2 * np.eye(len(step)) + unsure @ unsure.T
     return 0.5 * float(step @ np.linalg.solve(covariance, step))
 
 
 def _decided(states: Mapping[Verdict, float], other: float) -> Verdict:
-    """State with the best log evidence, if its odds are 1000 (`ODDS`); else 'unclear' or 'other'.
+    """State with the best log evidence if its odds are over 1000, else 'other' or 'unclear'.
 
-    ``states``: log evidence of each; ``other``: that of a share of its own for each joint.
+    'other' if free shares for each joint explain the rows better by such odds (`ODDS`).
+    ``states``: log evidence of each state; ``other``: that of free shares.
     """
     first, second = sorted(states, key=lambda state: states[state], reverse=True)[:2]
     if other - states[first] > np.log(ODDS):
@@ -348,9 +365,10 @@ def _decided(states: Mapping[Verdict, float], other: float) -> Verdict:
 def _shares(
     side: _ProjectedRows, start: Verdict, sigma: float, whole: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Shares and their standard deviations: of the whole correction, (1,), or of each joint, (k,).
+    """Shares of the correction that act, and their standard deviations, (1,) or (k,) each.
 
-    ``start``: state to begin from; ``sigma``: noise, m.
+    ``whole``: one share for all joints, else one for each; ``start``: state to begin from;
+    ``sigma``: noise of a reading per axis, m.
     """
     begin = STATES[start]
     change = side.command - side.wanted
@@ -375,9 +393,10 @@ def _shares(
 
 
 def _state_of_share(share: float, std: float) -> Verdict:
-    """State of a share, if its odds against the others are 1000; else 'unclear' or 'other'.
+    """State nearest to an estimated share, if its odds against the others are 1000.
 
-    'unclear' also for a std of 1 or more, 'other' beyond 3.3 stds of the nearest state.
+    Else 'unclear', also for a std of 1 or more; 'other' if beyond 3.3 stds of the nearest
+    state.
     """
     squared_distance = {state: ((share - value) / std) ** 2 for state, value in STATES.items()}
     first, second = sorted(squared_distance, key=lambda state: squared_distance[state])[:2]
@@ -389,7 +408,7 @@ def _state_of_share(share: float, std: float) -> Verdict:
 
 
 def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, float | None]:
-    """Share that is switched, with its state, and the noise of a row, mm.
+    """Share of the correction that acts when it is switched on, and the noise of a row, mm.
 
     From pairs of rows, on and off, of the same configuration, sensor and marker; both None for
     fewer than two pairs.
@@ -439,8 +458,8 @@ def _toggle(compensator: Compensator, visits: Visits) -> tuple[Estimate | None, 
 def _poses(side: _ProjectedRows, rivals: list[FloatArray]) -> int | None:
     """Number of poses that would exclude the alternatives; None if `MOST_POSES` would not.
 
-    At least half as many again as were measured. ``rivals``: steps between the states, (3 n,)
-    each.
+    At least half as many again as were measured. ``rivals``: projected displacements to the
+    alternatives, m, (d,) each.
     """
     unsure = side.projected(side.unsure(side.command))
     residual = side.projected(side.measured - side.at['in_use'])

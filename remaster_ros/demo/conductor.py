@@ -20,7 +20,7 @@ from remaster_ros.nodes.status import listen
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the demo."""
+    """ROS parameters of the demo."""
 
     out: str = parameter(
         '', 'folder of everything the demo writes: new, empty, or of a demo to go on with'
@@ -66,7 +66,7 @@ class Parameters:
 
 
 class Conductor(Node):
-    """Calls services, and follows the status of the nodes."""
+    """Node that calls the services of the other nodes, and keeps their last status."""
 
     def __init__(self) -> None:
         super().__init__('demo')
@@ -78,17 +78,20 @@ class Conductor(Node):
         self._clients_by_name: dict[str, Any] = {}
 
     def _on_summary(self, node: str, message: str, values: dict[str, str]) -> None:
-        """Keep the last summary of a node, its message and values, by name."""
+        """Keep the last summary of a node, by its name: its message and values."""
         self.summaries[node] = {'message': message, **values}
 
     def _on_record(self, record: EventRecord) -> None:
-        """Keep the time of a node's event, and the description of a planned tour."""
+        """Keep the times in a node's event, and the description of a planned tour."""
         if isinstance(record.body, TourPlanned):
             self.planned = record.body.description
         self.times.add(record.body)
 
     def call(self, service: str) -> Any:
-        """Call a std_srvs/Trigger service; return the future, None if it is not ready now."""
+        """Call a std_srvs/Trigger service; return the future of its response.
+
+        None, and no call, if the service is not ready now.
+        """
         if service not in self._clients_by_name:
             self._clients_by_name[service] = self.create_client(Trigger, service)
         client = self._clients_by_name[service]

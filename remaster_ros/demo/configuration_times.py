@@ -34,7 +34,10 @@ class ConfigurationTimes:
         self.rows: list[dict[str, float]] = []
 
     def add(self, event: Event | State) -> None:
-        """Take an event; only those of configurations count, not of a registration."""
+        """Add the times in an event; others than those of configurations are ignored.
+
+        Configurations of a registration do not count.
+        """
         match event:
             case PoseAnnounced(split='registration', stamp=stamp):
                 self._registration.add(stamp)
@@ -57,9 +60,9 @@ class ConfigurationTimes:
                     self.rows.append(row)
 
     def columns(self) -> dict[str, np.ndarray]:
-        """Return motion, settle, measuring (world s), software (wall s) of complete rows.
+        """Return the times of complete configurations by name, s, (n,); n = 0 if there are none.
 
-        Name -> (n,); n = 0 if none is complete.
+        Names are motion, settle and measuring, in world time, and software, in wall time.
         """
         needed = ('motion', 'settle', 'measuring', 'until_command')
         rows = [row for row in self.rows if all(name in row for name in needed)]

@@ -77,8 +77,8 @@ BEFORE_SESSION = {'log', 'ros_home', 'session'}
 def enough_candidates(cell: Workcell, seed: int, asked: int) -> int:
     """Return the number of candidates of each split that leaves `TO_FIT` poses to fit.
 
-    At least `asked`; `asked` as well if `MOST_CANDIDATES` are not enough, in which case the
-    planner says why. ``seed``: of the planned tour. The smallest such number is returned.
+    The smallest such number from `asked` on; `asked` itself if `MOST_CANDIDATES` are not
+    enough: the planner says why then. ``seed``: of the planned tour.
     """
     scene = cell.planning_scene(cell.chain())
     for count in range(asked, MOST_CANDIDATES + 1):
@@ -106,7 +106,10 @@ class Keyboard:
 
 
 class Demo:
-    """One run of the demo; ``stopping``: filled by signals, checked between all steps."""
+    """One run of the demo, from the start of its nodes to the printed results.
+
+    ``stopping``: filled by signals, checked between all steps.
+    """
 
     def __init__(self, node: Conductor, stopping: list[int]) -> None:
         self.node, self.p, self._stopping = node, node.p, stopping
@@ -236,7 +239,10 @@ class Demo:
             raise DeviceError(f'remaster {arguments[0]}: {done.stderr.strip()}')
 
     def _run(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Print a command of `remaster`, and run it in a process of its own."""
+        """Print and run a command of `remaster`; return the finished process with its output.
+
+        Nothing is raised if it fails.
+        """
         self.console.print(f'remaster {" ".join(arguments)}', soft_wrap=True)
         return subprocess.run(
             [sys.executable, '-m', 'remaster_ros.cli.main', *arguments],
@@ -246,10 +252,10 @@ class Demo:
         )
 
     def _apply(self) -> Path:
-        """Collect again with the bridge's correction; return the file of the correction.
+        """Collect other poses with the bridge's correction; return the file of the correction.
 
         That of the discovery if causes were looked for and it wrote one, else that of the fit.
-        Raises DeviceError as `_wait`.
+        Raises DeviceError as `_wait`, and if collecting is refused.
         """
         file = self.discovery / APPLY_FOLDER / COMPENSATION_FILE
         if not (self.requests and file.exists()):
@@ -311,10 +317,11 @@ class Demo:
     def _start_core(
         self, session: Path, seed: int, size: int, held_out: int, compensation: str = ''
     ) -> None:
-        """Start the nodes of a collection; ``session``: its folder; ``seed``: of the planner.
+        """Start the nodes of a collection (`CORE`), and return at once.
 
-        ``size, held_out``: candidate poses to fit and to validate; ``compensation``: file by which
-        the bridge corrects, '' for none.
+        ``session``: its folder; ``seed``: of the planner; ``size, held_out``: candidate poses
+        to fit and to validate; ``compensation``: file by which the bridge corrects, '' for
+        none.
         """
         rate, cell = {'simulated_clock_rate': self.p.rate}, {'cell': self.p.cell}
         # A fit of the corrected poses by an operator must not overwrite the first one.
@@ -345,7 +352,7 @@ class Demo:
             self.processes.start(name, config_path('fake.yaml'), overrides[name])
 
     def _spin(self) -> None:
-        """Handle messages for 0.1 s at most, and restarts of killed nodes.
+        """Handle messages for 0.1 s at most; restart nodes that were killed.
 
         Raises KeyboardInterrupt after a signal, DeviceError as `NodeProcesses.check`.
         """
@@ -366,10 +373,10 @@ class Demo:
         self._stopping.clear()
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-        """Wait for a condition; raise DeviceError after the timeout.
+        """Wait until a condition holds; raise DeviceError after the timeout.
 
-        ``what``: for the message. Messages are handled meanwhile; KeyboardInterrupt after a
-        signal.
+        ``timeout_s``: s of wall time; ``what``: what is waited for, for the message. Messages
+        are handled meanwhile. Raises KeyboardInterrupt after a signal.
         """
         deadline = time.monotonic() + timeout_s
         while not condition():
@@ -379,9 +386,9 @@ class Demo:
             self._spin()
 
     def _ready(self) -> bool:
-        """Whether all nodes are up, the robot reports and both sensors measure.
+        """Whether all nodes are up, the robot reports and all sensors of the cell measure.
 
-        By their last summaries.
+        By the last summaries of the nodes.
         """
         summaries = self.node.summaries
         return (
@@ -410,10 +417,10 @@ class Demo:
     def _trigger(self, service: str, server: str, timeout_s: float = ANSWER_WALL_S) -> None:
         """Call a service until it answers, also if its node is killed meanwhile.
 
-        ``server``: name of the node, whose restart has the service called again; ``timeout_s``: s
-        of wall time.
+        ``server``: name of the node; after its restart the service is called again;
+        ``timeout_s``: s of wall time.
 
-        Raises DeviceError if it refuses, or does not answer in time.
+        Raises DeviceError if the request is refused, or there is no answer in time.
         """
         future, process = None, self.processes.pid(server)
 
@@ -432,9 +439,10 @@ class Demo:
             raise DeviceError(f'{service}: {response.message}')
 
     def _collect(self) -> bool:
-        """Wait for the end of the collection; return False if it ended with a halted arm.
+        """Wait for the end of the collection, with a progress bar; print times of measuring.
 
-        Raises DeviceError if nothing is measured for `STANDS_WALL_S`.
+        Returns True, or False if it ended with a halted arm. Pauses are resumed as an operator
+        would. Raises DeviceError if nothing is measured for `STANDS_WALL_S`.
         """
         columns = (
             TextColumn('{task.description}'),
@@ -488,9 +496,11 @@ class Demo:
         return planner.get('state') == 'complete' and closed == 'complete'
 
     def _resume_if_paused(self) -> None:
-        """Resume where an operator would, since in the demo nothing has to be inspected.
+        """Call /remaster/collect if a pause or a killed planner waits for an operator.
 
-        With the live page an operator may be there, and gets a message instead.
+        In the demo nothing has to be inspected. Nothing while the arm is halted. With the live
+        page an operator may be there: unless the setup has changed, a message is printed
+        instead.
         """
         summaries = self.node.summaries
         planner, bridge = (summaries.get(name, {}) for name in ('pose_planner', 'robot_bridge'))
@@ -515,9 +525,10 @@ class Demo:
     def _wait_for_operator(self, halted: str) -> bool:
         """Wait for a person to end a halt, at the terminal or on the live page.
 
-        Returns whether the collection goes on: not if the person wants a fit, or nobody is there.
-        For the live page the rows so far are fitted meanwhile. Raises DeviceError if nobody is
-        there and nothing was measured. ``halted``: why, as the bridge states it.
+        Returns whether the collection goes on: not if the person wants a fit, or nobody is
+        there. If only the live page can end the halt, what was measured is fitted meanwhile.
+        Raises DeviceError if nobody is there and nothing was measured. ``halted``: why, as the
+        bridge states it.
         """
         done = self.node.summaries.get('pose_planner', {}).get('configurations_done', '0')
         self._say(f'the arm is halted: {halted}. {done} configurations were measured')
@@ -549,9 +560,9 @@ class Demo:
         return True
 
     def _clear_halt(self) -> None:
-        """Clear the halt, and collect, as an operator does after looking at the arm.
+        """Clear the halt, and go on with the collection, as an operator does.
 
-        `CLEARING_CALLS` times at most; a refusal is printed.
+        `CLEARING_CALLS` times at most; a refusal is printed, and the halt may remain.
         """
         for _ in range(CLEARING_CALLS):
             try:
@@ -565,23 +576,24 @@ class Demo:
             return
 
     def _say(self, text: str) -> None:
-        """Print a message for the operator, to stderr if the demo is quiet."""
+        """Print a message for the operator; to stderr with the option quiet."""
         if self.p.quiet:
             print(text, file=sys.stderr)
         else:
             self.console.print(text, soft_wrap=True)
 
     def close(self) -> None:
-        """End all processes, and remove the hidden World."""
+        """End all processes of nodes, and remove the folder of the hidden World."""
         self.processes.stop()
         shutil.rmtree(self.hidden, ignore_errors=True)
 
 
 def output_folder(path: Path) -> Path:
-    """Create a folder and its log/; or use an empty one, or that of an interrupted demo.
+    """Prepare the folder that the demo writes, with its folder log; return it.
 
-    A demo that was interrupted before its session began has left only logs. Returns the folder.
-    Raises InputError if the folder holds other files or cannot be written.
+    It is made, or empty, or that of a demo that was interrupted: with an unfinished session,
+    or before its session began, with only logs. Raises InputError if the folder holds other
+    files or cannot be written.
     """
     session = path / 'session'
     try:

@@ -33,7 +33,7 @@ def _die_with_parent() -> None:
 
 
 class NodeProcesses:
-    """The processes of nodes, each with its output in a file ``<name>.log``."""
+    """Processes of nodes, each with its output in a file ``<name>.log``; killed ones restart."""
 
     def __init__(self, log_folder: Path, environment: Mapping[str, str]) -> None:
         self._log_folder = log_folder
@@ -68,10 +68,10 @@ class NodeProcesses:
             )
 
     def check(self) -> list[str]:
-        """Restart killed processes, as a supervisor does; return their names.
+        """Restart processes that were killed by a signal; return the names of their nodes.
 
-        Raises DeviceError, with the last line of its log, if a process has ended by itself, or is
-        killed more than `SHORT_LIVES` times in a row within `SHORT_LIFE_S` of its start.
+        Raises DeviceError, with the last line of its log, if a process has ended by itself, or
+        is killed more than `SHORT_LIVES` times in a row within `SHORT_LIFE_S` of its start.
         """
         killed = []
         for name, process in list(self._running.items()):

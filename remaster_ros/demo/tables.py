@@ -25,7 +25,10 @@ from remaster_ros.types import Session
 
 
 def _table(title: str, *headings: str, left_aligned: int = 1) -> Table:
-    """Return an empty table, its first `left_aligned` columns left-aligned."""
+    """Return a table with these headings and no rows, to be filled and printed.
+
+    Its first `left_aligned` columns are left-aligned, the others right-aligned.
+    """
     table = Table(title=title)
     for column, heading in enumerate(headings):
         table.add_column(heading, justify='left' if column < left_aligned else 'right')
@@ -46,7 +49,10 @@ def print_times(console: Console, times: ConfigurationTimes) -> None:
 
 
 def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
-    """Print the offsets beside the true ones, and the error on validation poses."""
+    """Print tables of the offsets beside the true ones, and of the error on validation poses.
+
+    Also why an offset is not identifiable.
+    """
     title = 'joint zero-offsets, degrees'
     # The simulated arm is exactly its drawing: by that std the estimate is judged.
     drawn = 'std as drawn'
@@ -81,9 +87,9 @@ def print_offsets(console: Console, fit: Fit, truth: SessionTruth) -> None:
 
 
 def print_hidden(console: Console, discovery: Discovered, truth: SessionTruth) -> None:
-    """Print the found causes beside the hidden ones, with parameters, and the gain.
+    """Print a table of the hidden causes, whether each was found, and with which parameters.
 
-    Found causes that are not hidden are listed as such.
+    Found causes that are not hidden are listed as such. Then lines on the discovery's results.
     """
     found: dict[Any, list[FoundEffect]] = {}
     for claim in discovery.effects:
@@ -112,8 +118,9 @@ def true_errors(
 ) -> tuple[float, float]:
     """Return the mean true error of the tool without and with a correction, mm.
 
-    At the configurations of a session measured with the correction on. The true positions are
-    compared with the nominal arm, base and marker fitted for each of the two.
+    At the configurations of a session that was measured with the correction on. True positions
+    of the tool are compared with those of the nominal arm, with base and marker fitted for
+    each of the two.
     """
     m = session.measurements
     assert m.wanted is not None

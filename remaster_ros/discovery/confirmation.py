@@ -72,10 +72,10 @@ SHARES = (0.001, 0.003, 0.01)
 
 
 class Compared(Struct, frozen=True):
-    """Quantity compared in two sessions, in its unit: value and standard deviation of each.
+    """Quantity fitted to two sessions, in its unit: value and standard deviation in each.
 
-    ``sigmas`` is the difference, other less this, over the standard deviation of both together;
-    None if that is zero.
+    ``sigmas`` is the difference, other less this session's, over its standard deviation; None if
+    that is zero.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Compared(Struct, frozen=True):
 
 
 def rms_sigmas(rows: Sequence[Compared]) -> float | None:
-    """Return the root mean square of the differences in standard deviations; None of none."""
+    """Return the root mean square of the ``sigmas`` of some rows; None if none has one."""
     squares = [row.sigmas**2 for row in rows if row.sigmas is not None]
     return float(np.sqrt(np.mean(squares))) if squares else None
 
@@ -158,18 +158,18 @@ class Confirmation(Struct, frozen=True):
 
     @property
     def carries_over(self) -> bool:
-        """Whether more than half of what could be gained carries over."""
+        """Whether more than half of the possible gain carries over; False if that is unknown."""
         return self.carried_over is not None and self.carried_over > 0.5
 
 
 @one_thread
 def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) -> Confirmation:
-    """Compare a discovery with another session of the same arm.
+    """Compare the causes found in one session with another session of the same arm.
 
     Parameters
     ----------
     discovery, session
-        What was found, and the other session.
+        What was found in one session, and the other session.
     rng
         Draws the rows of a session that is too large to use all; see `thinning.draw_rows`.
 
@@ -230,10 +230,11 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
 
 
 def share_of_gain(before: float, frozen: float, refitted: float) -> float | None:
-    """Return the gain by frozen causes in mean square, as a share of the possible gain.
+    """Return the gain in mean square by causes as found, as a share of the possible gain.
 
-    Of RMS errors without causes, with frozen ones and with those fitted to the session itself. At
-    most 1: what frozen causes gain could be gained. None if that is next to nothing.
+    ``before``, ``frozen``, ``refitted``: RMS errors of a session without causes, with them as
+    found in the other session, and with them fitted to this session, m. At most 1; negative if
+    ``frozen`` is the largest. None if the possible gain is next to nothing (`LEAST_GAIN`).
     """
     could = before**2 - min(refitted, frozen) ** 2
     if could < LEAST_GAIN * before**2:
@@ -242,15 +243,18 @@ def share_of_gain(before: float, frozen: float, refitted: float) -> float | None
 
 
 def _with(choices: Choices, index: int, choice: Choice) -> Choices:
+    """Return a copy of the choices with that at an index replaced."""
     return (*choices[:index], choice, *choices[index + 1 :])
 
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Normal equations of a session for its natural parameters and m of the arm's errors.
+    """Normal equations of a session for its natural parameters and the arm's errors.
 
-    Products X'WX of the columns of the former, the latter, and the errors; ``plain`` where errors
-    of the measuring are none.
+    Natural parameters are zero-offsets, registrations and markers; the arm's errors have m
+    parameters. Both ``products`` and ``plain`` are X'WX of the columns of these, of the arm's
+    errors, and of the residuals; errors of the measurement are marginalised in ``products``
+    and ignored in ``plain``.
     """
 
     data: Residuals
@@ -265,7 +269,11 @@ class _Measured:
         candidates: Sequence[Candidate],
         nuisance: Sequence[_Weighted],
     ) -> _Measured:
-        """Assemble the equations of rows, with the candidates `nuisance` marginalised."""
+        """Assemble the equations of the rows of ``data``.
+
+        ``candidates``: of the arm's errors, with parameters of their own; ``nuisance``: of
+        errors of the measurement, marginalised in `products`.
+        """
         natural = data.full_jacobian[data.rows.source]
         further = data.columns([candidate for candidate, _ in nuisance])
         parts = natural, data.columns(candidates), data.errors[:, :, None], further
@@ -285,9 +293,9 @@ class _Measured:
         return int(self.data.full_jacobian.shape[2])
 
     def apart(self, precision: FloatArray) -> tuple[FloatArray, float]:
-        """Return the products with the arm's errors marginalised, and the log evidence lost.
+        """Return `products` with the arm's errors marginalised, and the log evidence lost by that.
 
-        ``precision``: of the errors' prior, (m, m).
+        ``precision``: of the prior on their parameters, (m, m).
         """
         where = slice(self.size, self.size + len(precision))
         across = self.products[where]
@@ -298,9 +306,11 @@ class _Measured:
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
-    """Log evidence of some choices up to a constant, and the posterior of all that is fitted.
+    """Joint fit of two sessions: log evidence, up to a constant, and posterior.
 
-    That begins with all of this session; ``there`` is where the other's are, -1 what is absent.
+    ``values``: posterior means, those of this session first; ``root``: upper Cholesky factor
+    of their precision; ``there``: index in ``values`` of each parameter of the other session,
+    -1 if it is absent there.
     """
 
     log_evidence: float
@@ -309,7 +319,7 @@ class _Fitted:
     there: IntArray
 
     def covariance(self, where: IntArray) -> FloatArray:
-        """Return the covariance of some parameters; ``where``: their indices."""
+        """Return the posterior covariance of some parameters; ``where``: indices in `values`."""
         unit = np.zeros((len(self.values), len(where)))
         unit[where, np.arange(len(where))] = 1.0
         found: FloatArray = cho_solve((self.root, False), unit)[where]
@@ -318,11 +328,12 @@ class _Fitted:
 
 @dataclass(frozen=True, eq=False)
 class _Both:
-    """Both sessions with the candidates of the arm's errors on their rows.
+    """Two sessions of an arm, this (``here``) and the other (``there``), for joint fits.
 
-    As found and as wide as both need them, and which make each cause; what each session knows;
-    precision of the prior on their m parameters, (m, m); the other session fitted without causes;
-    which zero-offsets this one determines, (k,).
+    ``found``: candidates of the arm's errors as found in this session; ``candidates``: the same
+    with curves that reach over both sessions, of m parameters with the prior ``precision``,
+    (m, m); ``groups``: indices of those that make each cause; ``fit``: the other session without
+    causes; ``identifiable``: zero-offsets that this session determines, (k,).
     """
 
     found: tuple[Candidate, ...]
@@ -338,7 +349,11 @@ class _Both:
 
     @classmethod
     def of(cls, discovery: Discovery, fit: Estimate, rng: np.random.Generator) -> _Both:
-        """Assemble both sessions; `fit`: of the other session; its rows are thinned by `rng`."""
+        """Assemble the equations of both sessions.
+
+        ``discovery``: of this session; ``fit``: of the other session, with offsets only, whose
+        rows are thinned by ``rng`` if they are many.
+        """
         mine, theirs = discovery.residuals, Residuals.of(fit)
         theirs = theirs.only(draw_rows(fit.problem.measurements, fit.kept, rng))
         named = [candidate for group in discovery.groups for candidate in group]
@@ -375,13 +390,20 @@ class _Both:
         return self.fit.model.joints
 
     def where(self, group: Sequence[int]) -> IntArray:
-        """Return the indices of some candidates' parameters among the m."""
+        """Return the indices of the parameters of some candidates among the m of all `candidates`.
+
+        ``group``: indices of these candidates; (0,) if it is empty.
+        """
         edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         parts = [np.arange(edges[i], edges[i + 1]) for i in group]
         return np.concatenate([np.zeros(0, np.int64), *parts])
 
     def fitted(self, choices: Choices) -> _Fitted:
-        """Fit both sessions with some choices."""
+        """Fit both sessions at once: each zero-offset and cause shared, own, or absent there.
+
+        ``choices``: of each zero-offset, then of each cause in `groups`; 'own' is another
+        value in the other session, 'absent' 0 there.
+        """
         here, there, k, m = self.here, self.there, self.joints, len(self.precision)
         first, second = here.size + m, there.size
         per_radian = self.fit.model.chain.per_radian
@@ -418,15 +440,20 @@ class _Both:
 
     @cached_property
     def _of_the_other(self) -> tuple[FloatArray, float]:
-        """Products of the other session, its own errors marginalised, and the evidence lost."""
+        """Products of the other session's equations, and the log evidence lost to its own errors.
+
+        If `share` is above 0, errors of the arm with that share of the prior variance are
+        marginalised; else the products are as they are, and 0 is lost.
+        """
         if self.share == 0.0:
             return self.there.products, 0.0
         return self.there.apart(self.precision / self.share)
 
     def most_likely(self) -> tuple[_Both, Choices]:
-        """Return the choices with the most evidence that single changes reach from all 'shared'.
+        """Return both sessions at their most likely `share`, and the most likely choices.
 
-        Each change counts if its odds are above twenty to one.
+        Hill climbing from all 'shared' by single changes, while one raises the log evidence by
+        more than `NEEDED` (odds of twenty to one).
         """
         # What happened once is no matter of the other session.
         possible = [CHOICES[:2]] * self.joints
@@ -450,9 +477,13 @@ class _Both:
     def judged(
         self, best: Choices, index: int, rows: BoolArray, effect: FoundEffect
     ) -> ConfirmedCause:
-        """Judge one cause, all others at their best choices; RMS errors are those of `rows`.
+        """Compare a cause in both sessions: its evidence, parameters and RMS errors.
 
-        A cause without a candidate in `found` has 0 rows and no errors.
+        ``best``: choices of all zero-offsets and causes, which the evidence keeps for the
+        others; ``index``: of the cause in `groups`; ``rows``: mask of rows of the other
+        session, to which its RMS errors are restricted (see `error`), with all other causes
+        fitted to that session. A cause without candidates (a step) has 0 rows, no errors and
+        the answer 'open'.
         """
         group = self.groups[index]
         if not group:
@@ -475,17 +506,27 @@ class _Both:
 
     @cached_property
     def alone(self) -> _Fitted:
-        """Each session by itself."""
+        """Fit of both sessions with every zero-offset and cause of its own in each.
+
+        Candidates that are in no cause remain shared.
+        """
         every: Choices = (CHOICES[1],) * (self.joints + len(self.groups))
         return self.fitted(every)
 
     @cached_property
     def _spread(self) -> FloatArray:
-        """Covariance of the m parameters by this session, (m, m)."""
+        """Covariance of the m parameters of `candidates` by this session (`here`), (m, m).
+
+        With their prior. Candidates that make no cause are fitted to both sessions at once.
+        """
         return self.alone.covariance(self.here.size + np.arange(len(self.precision)))
 
     def told(self, group: Sequence[int]) -> BoolArray:
-        """Return the other session's rows with a cause's drivers as seen here, (all rows,)."""
+        """Mask of the other session's rows in which a cause's driver is in the range seen here.
+
+        ``group``: indices of the cause's candidates: in range for one of them is enough; all
+        rows if it is empty. (all rows,).
+        """
         context, mine = self.there.data.context, self.here.data.part
         seen = [_seen(self.found[i], mine)(context) for i in group]
         return np.any(seen, axis=0) if group else np.ones(len(context), dtype=bool)
@@ -498,10 +539,13 @@ class _Both:
         rows: BoolArray | None = None,
         joint_offsets: FloatArray | None = None,
     ) -> float:
-        """Return the RMS error of the other session with some candidates absent, or as found here.
+        """Return the RMS 3-D error of the other session with some candidates fixed, m.
 
-        All else, and what this session does not tell, is fitted to it. Of its validation rows, or
-        the fitted ones without any; of those in ``rows`` (all rows,), where there are such.
+        ``absent``, ``frozen``: indices of candidates whose parameters are 0, or as found in
+        this session; ``joint_offsets``: zero-offsets to keep, rad or m, (k,). Parameters of
+        these candidates that this session hardly determines are fitted to the other session,
+        as is all else. The error is of its validation rows, or of the fitted rows if it has
+        none; only of those in ``rows``, (all rows,), unless that leaves none.
         """
         there, k, size = self.there, self.joints, self.there.size
         parameters = np.full(size + len(self.precision), np.nan)
@@ -528,13 +572,14 @@ class _Both:
         return rms(residuals, judged)
 
     def own(self, best: Choices) -> list[int]:
-        """Return the joints (from 0) whose zero-offset differs between the sessions."""
+        """Return the joints (from 0) whose choice in ``best`` is 'own': another value there."""
         return [joint for joint, choice in enumerate(best[: self.joints]) if choice == 'own']
 
     def offsets(self, best: Choices, joint: int) -> tuple[FloatArray, FloatArray] | None:
-        """Return the two zero-offsets of a joint, rad or m, (2,), and their covariance, (2, 2).
+        """Return a joint's zero-offset in this and the other session, and their covariance.
 
-        The causes as they are best; None if one of the sessions does not determine it.
+        (2,), rad or m, and (2, 2). ``best``: choices, kept for all else; ``joint``: from 0.
+        None if one of the sessions does not determine the offset.
         """
         fit = self.fitted(_with(best, joint, 'own'))
         where = np.array([joint, fit.there[joint]])
@@ -546,7 +591,11 @@ class _Both:
         return self.here.data.context.joint_offsets[joint] + fit.values[where], covariance
 
     def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
-        """Compare the zero-offsets that both sessions determine, at the best choices of causes."""
+        """Compare the zero-offset of each joint that both sessions determine, in degrees or mm.
+
+        ``best``: choices, kept for all else. Joints that one session does not determine are
+        left out.
+        """
         rows: list[Compared] = []
         chain = discovery.fit.chain
         for joint, name in enumerate(discovery.fit.joint_names):
@@ -557,7 +606,12 @@ class _Both:
         return tuple(rows)
 
     def _side_by_side(self, group: Sequence[int], fit: _Fitted) -> tuple[Compared, ...]:
-        """Compare the parameters of a cause, of a curve its heights at the places seen in both."""
+        """Compare the parameters of a cause in both sessions.
+
+        ``group``: indices of its candidates; ``fit``: one in which the cause has parameters of
+        its own in each session. Of a curve: heights, less their mean, at the places that both
+        sessions measured; left out if there are fewer than two.
+        """
         rows: list[Compared] = []
         for i in group:
             candidate, wide, where = self.found[i], self.candidates[i], self.where([i])
@@ -586,9 +640,10 @@ class _Both:
 def _compared(
     names: Sequence[str], unit: str, values: FloatArray, covariance: FloatArray
 ) -> list[Compared]:
-    """Compare n values of this session with those of the other, (2 n,): difference in sigmas.
+    """Compare n values of this session with those of the other, both in ``values``, (2 n,).
 
-    This session's values come first; the difference is None if its standard deviation is 0.
+    This session's values come first; ``covariance``: (2 n, 2 n). ``sigmas`` is None if the
+    difference has no standard deviation.
     """
     found, n = [], len(names)
     variance = np.diag(covariance)
@@ -602,7 +657,11 @@ def _compared(
 
 
 def answer_of(evidence: Mapping[Choice, float]) -> Answer:
-    """Return the answer by the evidence of each choice; 'open' if presence or size is."""
+    """Return the answer on a cause by the log evidence of 'shared', 'own' and 'absent'.
+
+    'changed' or 'absent' if one of these clearly beats 'shared'; 'confirmed' if 'shared' clearly
+    beats 'absent' and beats 'own' by a factor of two; else 'open'.
+    """
     shared, own_evidence, absent = evidence['shared'], evidence['own'], evidence['absent']
     if max(own_evidence, absent) > shared + NEEDED:
         return 'changed' if own_evidence > absent + NEEDED else 'absent'
@@ -612,9 +671,10 @@ def answer_of(evidence: Mapping[Choice, float]) -> Answer:
 
 
 def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, list[_Weighted]]:
-    """Return a session's noise, and its measuring errors with their prior precisions.
+    """Return a session's noise, and its errors of the measurement with their prior precisions.
 
-    [] for the latter unless all kinds of errors together explain the session better.
+    ``causes``: candidates to fit first. [] for the errors unless all kinds of errors together
+    explain the session clearly better.
     """
     candidates = [
         candidate
@@ -640,9 +700,10 @@ def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, lis
 
 
 def _natural(size: int, per_radian: FloatArray | None = None) -> FloatArray:
-    """Return the prior precision of natural parameters, (size,); zero-offsets come first, if any.
+    """Return the prior precision of a session's natural parameters, (size,).
 
-    Registrations and markers are known to a metre and a radian: to nothing that counts.
+    1 each: registrations and markers are known to a metre or radian. With ``per_radian``, (k,),
+    the first k are zero-offsets, with a standard deviation of `STEP_STD` times that.
     """
     found = np.ones(size)
     if per_radian is not None:
@@ -651,14 +712,21 @@ def _natural(size: int, per_radian: FloatArray | None = None) -> FloatArray:
 
 
 def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve with a positive definite matrix of parameters in units far apart."""
+    """Return the solution of a positive definite system whose parameters have units far apart.
+
+    ``matrix``: (c, c); ``right``: (c,) or (c, r).
+    """
     unit = np.diag(matrix) ** -0.5
     factor = cho_factor(matrix * np.outer(unit, unit), check_finite=False)
     return (unit * cho_solve(factor, (unit * right.T).T, check_finite=False).T).T
 
 
 def _prior(discovery: Discovery, candidate: Candidate, wide: Candidate) -> FloatArray:
-    """Return the precision of a candidate's parameters, (m, m): by size here, or smoothness."""
+    """Return the prior precision of the parameters of a candidate of the arm's errors, (m, m).
+
+    ``wide``: the candidate `widened`. Of a free form or a member of no cause: that of the
+    discovery's solution; else of a standard deviation as large as the parameters found.
+    """
     solution, fit = discovery.solution, discovery.fit
     is_cause = any(candidate in group for group in discovery.groups)
     if candidate in solution.candidates and (candidate.penalty is not None or not is_cause):
@@ -674,7 +742,10 @@ def _prior(discovery: Discovery, candidate: Candidate, wide: Candidate) -> Float
 
 
 def _driver(context: Context, candidate: Candidate) -> Driver:
-    """Driver that a candidate depends on, of its last joint if it has joints."""
+    """Return the driver that a candidate depends on, of its last joint if it has joints.
+
+    AssertionError if the driver is not a single quantity.
+    """
     driver = driver_named(
         context, candidate.driver, candidate.joints[-1] if candidate.joints else 0
     )
@@ -683,7 +754,11 @@ def _driver(context: Context, candidate: Candidate) -> Driver:
 
 
 def widened(candidate: Candidate, mine: Context, theirs: Context) -> Candidate:
-    """Return a candidate whose free form reaches over both sessions, of mean zero over this."""
+    """Return a copy of a candidate whose curve reaches over the values of both sessions.
+
+    Its mean over this session's values (``mine``) is zero. The candidate itself if it has no
+    curve, or is not about a joint's angle.
+    """
     if candidate.curve is None or candidate.place != 'joint_angle':
         return candidate
     driver = _driver(mine, candidate)
@@ -698,11 +773,16 @@ def widened(candidate: Candidate, mine: Context, theirs: Context) -> Candidate:
 
 
 def _free(context: Context, joint: int, driver: Driver, curve: Curve) -> Design:
+    """Return columns of a curve of a driver that adds to a joint's (1-based) position."""
     return Design(joint - 1, curve.columns(driver.value(context)))
 
 
 def _seen(candidate: Candidate, mine: Context) -> Callable[[Context], BoolArray]:
-    """Return a function that tells rows in which the driver is in the range seen here."""
+    """Return a function of a context: mask of rows in the range that this session saw, (n,).
+
+    The range is that of the candidate's driver in ``mine``; of a curve, near a value seen; of a
+    field or distortion, a box of positions in its sensor's frame. True in all rows for others.
+    """
     driver = driver_named(mine, candidate.driver, candidate.joints[-1] if candidate.joints else 0)
     if driver is not None:
         if candidate.curve is not None:
@@ -725,12 +805,17 @@ def _seen(candidate: Candidate, mine: Context) -> Callable[[Context], BoolArray]
 
 
 def _between(values: FloatArray, seen: FloatArray) -> BoolArray:
+    """Mask of the values within the range of ``seen``, ends included."""
     inside: BoolArray = (values >= seen.min()) & (values <= seen.max())
     return inside
 
 
 def require_other_session(session: Session, other: Session) -> None:
-    """Refuse, by InputError, other robots, sensors or markers, or a session with itself."""
+    """Raise InputError if two sessions cannot be compared.
+
+    If joints, geometry, sensors or markers differ, or if more than a tenth of the rows of the
+    smaller session are also in the other.
+    """
     mine, theirs = Problem.of(session), Problem.of(other)
     if mine.chain.joint_names != theirs.chain.joint_names:
         raise InputError(
@@ -760,14 +845,20 @@ def require_other_session(session: Session, other: Session) -> None:
 
 
 def _readings(session: Session) -> set[bytes]:
-    """Return joint angles and position of every row, to a nanoradian and a nanometre."""
+    """Return the joint positions and measured position of each row as bytes, rounded.
+
+    To 1e-9 rad or m, so that equal readings of two sessions can be found.
+    """
     m = session.measurements
     rounded = np.round(np.concatenate((m.q, m.position), axis=1), 9) + 0.0
     return {row.tobytes() for row in rounded}
 
 
 def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
-    """Return sentences: whose zero-offsets these are, and how far each cause holds there."""
+    """Return sentences on a confirmation: whether the zero-offsets are the same, then each cause.
+
+    Only `why` if nothing can be compared; a single sentence if the offsets are another arm's.
+    """
     found = confirmation
     if found.why:
         return [found.why]

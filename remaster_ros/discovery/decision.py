@@ -26,7 +26,7 @@ Answer = Literal['cause', 'look_alike', 'open', 'neither']
 
 
 class Named(Struct, frozen=True):
-    """A cause: name and joints (1-based)."""
+    """Name and joints (1-based) of a cause."""
 
     name: str
     joints: tuple[int, ...]
@@ -54,7 +54,11 @@ class Decision(Struct, frozen=True):
     def of(
         cls, cause: Named, look_alike: Named, answer: Answer, log_evidence: float | None = None
     ) -> Decision:
-        """Decision by the difference of the log evidence, in numbers and words."""
+        """Return the decision with its sigma and sentence.
+
+        ``log_evidence``: of the cause less that of its look-alike; None if the search now names
+        neither: sigma is 0 then.
+        """
         if log_evidence is None:
             words = f'the search now names neither {cause} nor {look_alike}'
             return cls(cause, look_alike, answer, None, 0.0, words)
@@ -67,7 +71,10 @@ class Decision(Struct, frozen=True):
 
 
 def sigma_of(log_odds: float) -> float:
-    """Return the standard deviations whose one-sided tail has the probability of these odds."""
+    """Return the one-sided Gaussian significance of odds, in standard deviations, 0 or more.
+
+    ``log_odds``: natural logarithm; its sign does not matter.
+    """
     return max(0.0, float(-ndtri_exp(-np.logaddexp(0.0, abs(log_odds)))))
 
 
@@ -78,15 +85,19 @@ def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[D
     Parameters
     ----------
     found
-        The search of all that was measured.
+        Discovery in all that was measured.
     pairs
-        A cause and its look-alike of an earlier search.
+        A cause and its look-alike of an earlier search; pairs given twice count once.
     """
     return tuple(_decision(found, *pair) for pair in dict.fromkeys(pairs))
 
 
 def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
-    """Decision between a cause and a look-alike by log evidence; 'neither' if both are gone."""
+    """Decide between a cause and a look-alike by log evidence.
+
+    'neither' if the search named none of the two, or none can be fitted; 'open' unless the odds
+    exceed twenty to one and the winner is among the causes named.
+    """
     # Named are causes that the search has found now; part of a solution may be located structure.
     named = [Named(effect.name, effect.joints) for effect in found.effects]
     if cause not in named and look_alike not in named:
@@ -109,7 +120,11 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
 
 
 def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
-    """Return the other causes, and the background without the kinds of these."""
+    """Return the candidates of a discovery's model with some causes taken out.
+
+    All candidates of named causes that belong to none of ``causes``; and the background families
+    that have no member of such a name, and no parameter of any named cause.
+    """
     named = [candidate for group in found.groups for candidate in group]
     kinds = {cause.name for cause in causes}
     have = {name for candidate in named for name in candidate.parameters}
@@ -129,7 +144,7 @@ def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
 
 
 def _belongs(candidate: Candidate, cause: Named) -> bool:
-    """Whether a candidate is of a cause: of its name, and of all its joints or one of them."""
+    """Return whether a candidate has a cause's name, and all its joints or just one of them."""
     parts = [(joint,) for joint in cause.joints]
     return candidate.name == cause.name and (
         candidate.joints == cause.joints or candidate.joints in parts
@@ -137,14 +152,18 @@ def _belongs(candidate: Candidate, cause: Named) -> bool:
 
 
 def _without(found: Discovery, *causes: Named) -> float:
-    """Log evidence of the discovery's model without some causes; -inf if it has no solution."""
+    """Log evidence of the discovery's model without some causes; -inf if that cannot be fitted."""
     remaining = _rest(found, *causes)
     bare = solve(found.residuals, remaining, found.solution)
     return -np.inf if bare is None else bare.log_evidence
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
-    """Return the log evidence with a cause in place of another; None if it cannot be fitted."""
+    """Return the log evidence with one cause and without another; None if it cannot be fitted.
+
+    The cause has its candidates in the model if these cover all its joints, else the best of
+    `_variants`. Fits with a sign that physics excludes do not count.
+    """
     every, remaining = _candidates(found), _rest(found, cause, other)
     named = [candidate for group in found.groups for candidate in group]
     present = tuple(candidate for candidate in named if _belongs(candidate, cause))
@@ -161,9 +180,10 @@ def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
 
 
 def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate, ...]]:
-    """Sets of candidates that a cause can be: each candidate of its joints, alone.
+    """Return the sets of candidates that a cause can be made of.
 
-    If there are none, one candidate for each of the joints together; [] if a joint has none.
+    ``every``: candidates to choose from. One set for each candidate of exactly the cause's
+    joints; if there are none, one set with a candidate for each joint; [] if a joint has none.
     """
     mine = [candidate for candidate in every if candidate.name == cause.name]
     singles: list[tuple[Candidate, ...]] = [
@@ -179,9 +199,9 @@ def _variants(every: Sequence[Candidate], cause: Named) -> list[tuple[Candidate,
 
 
 def _candidates(found: Discovery) -> list[Candidate]:
-    """Candidates of all effects that the session can show, except costly ones.
+    """Return the candidates of all effects that the session can show.
 
-    Effects that move the fit itself are left out, too.
+    Effects with very many candidates (`costly`) and marker offsets (`moves_the_fit`) are left out.
     """
     context = found.residuals.context
     return [

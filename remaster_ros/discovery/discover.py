@@ -67,9 +67,9 @@ class Discovery:
     ----------
     verdict
         'effects', 'none', 'undetermined' where the leading explanations tie, or 'unexplained'
-        where the causes that were searched do not hold on poses never fitted.
+        where errors are left that no cause explains.
     effects
-        The causes, the largest first.
+        The causes, the largest first; then markers that have moved.
     gain, metrics
         On the validation rows, as `gain_of` returns them.
     pose_common_fraction
@@ -104,16 +104,16 @@ class Discovery:
         Of a moving session: how late each sensor's stamps are beside the joints', and std, s. They
         were taken out before the search.
     alone
-        The sampled fit whose zero-offsets are right where nothing else of the arm is corrected:
-        with errors of the measurement taken out where they are certain, and no other.
+        The sampled fit for a controller that takes zero-offsets alone: errors of the measurement
+        that are certain are taken out, errors of the arm are left in the offsets.
     std_if_drawn
         Standard deviation of the zero-offsets of ``fit`` if the arm is exactly its drawing; NaN
         where the gauge holds them, rad, (k,).
     search
         How far the chains of the walk agree, and the causes that are rather not there.
     geometry
-        All lengths and tilts beside the zero-offsets, the same taken out; None if they cannot
-        be fitted.
+        All link lengths and axis tilts fitted beside the zero-offsets, with the same errors of the
+        measurement taken out; None if they cannot be fitted.
     """
 
     verdict: Verdict
@@ -142,10 +142,11 @@ class Discovery:
 
     @property
     def loads_geometry(self) -> bool:
-        """Whether a robot model with all lengths and tilts is worth loading.
+        """Whether a robot model with all fitted lengths and tilts is worth loading.
 
-        Held-out poses decide; without them, or where these gain by chance alone, that a length or
-        tilt is among the causes.
+        False without `geometry`. True if it predicts held-out poses clearly better than the
+        drawing; if only by little, or without held-out rows, if a length or tilt is among the
+        causes.
         """
         if self.geometry is None:
             return False
@@ -252,7 +253,7 @@ def discover_session(
 
 @dataclass(frozen=True, eq=False)
 class _Searched:
-    """What the walk over models has found."""
+    """Result of the walk over models: models with their shares, causes and background."""
 
     data: Residuals  # Rows that were searched
     models: list[tuple[Solution, float]]  # Each with its share, the best first
@@ -265,7 +266,7 @@ class _Searched:
 
 @dataclass(frozen=True, eq=False)
 class _Checked:
-    """The sampled model: that of the walk, or the offsets alone if it does not hold."""
+    """Model that was sampled: that of the search, or the offsets alone if that does not hold."""
 
     found: Estimate
     data: Residuals
@@ -283,7 +284,7 @@ class _Checked:
 
 @dataclass(frozen=True, eq=False)
 class _Answer:
-    """Verdict, causes and structure without a cause."""
+    """Verdict of a search, with its causes and errors that no cause explains."""
 
     verdict: Verdict
     effects: tuple[FoundEffect, ...]  # The largest first, then markers that have moved
@@ -293,14 +294,21 @@ class _Answer:
 
 
 def _bare(data: Residuals) -> Solution:
-    """Fit of the offsets without any cause."""
+    """Fit the offsets model without any cause to the residuals.
+
+    AssertionError if that has no solution.
+    """
     solution = solve(data, ())
     assert solution is not None
     return solution
 
 
 def _candidates(context: Context) -> tuple[list[Candidate], dict[str, str]]:
-    """Return all candidate causes of a session, and why effects are not testable, by name."""
+    """Return all candidate causes of a session, and the effects that it cannot show.
+
+    Changes in mid-session are among the former, effects judged by the fit itself (marker
+    offsets) are not. The latter: name -> reason.
+    """
     effects_tried = effects_of(context)
     untestable = {
         name: why for name, effect in effects_tried.items() if (why := effect.needs(context))
@@ -323,7 +331,11 @@ def _searched(
     rng: np.random.Generator,
     report: Progress,
 ) -> _Searched:
-    """Walk over models; again if the best one judges other rows to be gross errors."""
+    """Walk over models of causes; twice if the best model changes which rows are gross errors.
+
+    ``found``: the fit; ``residuals``: its residuals; ``pool``: rows to search, gross or not;
+    ``candidates``: all causes to try; ``report``: called with the stage and the share done.
+    """
     walking = partial(report, 'searching causes')
     walk = Walk(residuals, candidates, rng, walking, None)
     data = _judged(found, residuals, walk.best, pool)
@@ -350,9 +362,10 @@ def _checked(
     searched: _Searched,
     sampled: Callable[..., tuple[FitResult, tuple[Gain, Mapping[str, Any]], FloatArray]],
 ) -> _Checked:
-    """Sample the best model; the offsets alone if it does not settle or predicts worse.
+    """Sample the best model; or the offsets alone, if it cannot be fitted or predicts worse.
 
-    ``sampled``: `_sampled` of the session.
+    ``before``: fit of the offsets alone; ``found``: the fit to extend; ``sampled``: `_sampled`
+    of the session.
     """
     data, effects = searched.data, searched.effects
     named = [candidate for group in searched.groups for candidate in group]
@@ -415,7 +428,11 @@ def _answer(model: _Checked) -> _Answer:
 
 
 def _verdict(effects: Sequence[FoundEffect], unexplained: Sequence[Unexplained]) -> Verdict:
-    """Verdict by the causes and the structure that no cause explains."""
+    """Return the verdict on a search.
+
+    'undetermined' if the largest cause or one of a large share ties with a look-alike; else
+    'effects' if there are causes, 'unexplained' if there is structure without, else 'none'.
+    """
     # A tie over a small remainder does not put the rest in doubt. The largest leads in any case:
     # where held-out poses gain nothing no share is known.
     leading = [effect for effect in effects if (effect.share or 0.0) > LEADING_SHARE]
@@ -434,7 +451,8 @@ def _offsets_alone(
 ) -> FitResult:
     """Sampled fit for a controller that takes zero-offsets alone, see `Discovery.alone`.
 
-    ``measurement_errors``: causes outside the arm that are certain; these are taken out.
+    ``measurement_errors``: causes outside the arm that are certain; these are taken out. If
+    the model has no other candidates, its fit is returned.
     """
     # Kinds that nobody named are in no file with zero-offsets either.
     if {*model.solution.candidates} <= {*measurement_errors}:
@@ -454,7 +472,11 @@ def _offsets_alone(
 def _to_search(
     session: Session, before: Estimate, rng: np.random.Generator
 ) -> tuple[Estimate, Residuals, IntArray]:
-    """Return the fit to be extended by causes, its residuals, and the rows to search."""
+    """Return the fit to be extended by causes, its residuals, and the rows to search.
+
+    ``before``: fit of the offsets alone; fitted again with wide priors for markers that have
+    moved. ``rng``: draws the rows, indices in the session, if they are many.
+    """
     found, residuals = before, Residuals.of(before)
     bare = solve(residuals, ())
     moved = moved_markers(found, residuals, bare.noise, ()) if bare is not None else ()
@@ -483,7 +505,9 @@ def _sampled(
 ) -> tuple[FitResult, tuple[Gain, Mapping[str, Any]], FloatArray]:
     """Sample the first of some models, each with its share, and measure its gain.
 
-    Returns also the std of the zero-offsets if the arm is exactly its drawing, rad, (k,).
+    Returns the sampled fit, `gain_of` it, and the std of the zero-offsets if the arm is
+    exactly its drawing, rad, (k,). ``before``: fit of the offsets alone; ``found``: the fit
+    that ``models`` extend; ``named``: candidates of the causes.
     """
     solution = models[0][0]
     unmodelled = Unmodelled.of(found, data, solution)
@@ -510,9 +534,11 @@ def _sampled(
 def _judged(
     found: Estimate, residuals: Residuals, solution: Solution, pool: IntArray
 ) -> Residuals:
-    """Residuals of the pool's rows that are not gross in the model.
+    """Residuals of the pool's rows that are not gross errors in a model.
 
-    `residuals` itself if the rows are the same, or if too few would be left.
+    Rows that are near the moment of a step count as gross only if they are so with the step
+    earlier and later, too. `residuals` itself if the rows are the same, or if too many would
+    be gross.
     """
     every = residuals.only(pool)
     gross = None
@@ -539,14 +565,15 @@ def _judged(
 
 
 def _residuals_as_given(residuals: FloatArray, kept: BoolArray) -> FloatArray:
-    """Return residuals of a model that is not fitted again, whichever rows are kept."""
+    """Return ``residuals`` unchanged, whichever rows are kept: the model is not fitted again."""
     return residuals
 
 
 def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
-    """Return residuals of a model, m, (n, 3), as it is and with each step earlier and later.
+    """Return residuals of a model, m, (n, 3): as it is, and with each step earlier and later.
 
-    Rows just before or after a step look gross where it is dated without them.
+    Two more for each candidate of a moment. Rows just before or after a step look gross if the
+    step is dated a little wrong.
     """
     residuals = [data.left(solution)]
     reach = DATED_TO * float(np.ptp(data.context.elapsed_s))

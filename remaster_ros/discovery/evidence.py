@@ -52,7 +52,7 @@ _LARGE = 18.0
 
 
 def log_prior_one_by_one(candidates: Sequence[Candidate]) -> float:
-    """Return the log prior probability of candidates among all that are tried."""
+    """Return the log prior probability of a set of candidates: sum of -log(`drawn_from`)."""
     return -float(sum(np.log(candidate.drawn_from) for candidate in candidates))
 
 
@@ -61,7 +61,8 @@ def solve(
 ) -> Solution | None:
     """Fit a set of candidates, which may be empty; None if they cannot be distinguished.
 
-    The search for noise and smoothness begins at those of `start`, if given.
+    Noise and smoothness maximise the restricted likelihood; the search begins at those of
+    ``start``, if given.
     """
     system = System.of(data, candidates)
     if system is None or not system.visible():
@@ -77,7 +78,8 @@ def solve(
 class System:
     """Mixed-model equations of one set of candidates, in scaled columns.
 
-    The Gram matrices are `packed`, (groups, length of size + 1).
+    Penalised parameters are random effects. The Gram matrices are `packed`, (error groups,
+    length of size + 1).
     """
 
     model: NoiseModel
@@ -90,7 +92,10 @@ class System:
 
     @classmethod
     def of(cls, data: Residuals, candidates: Sequence[Candidate]) -> System | None:
-        """Assemble the equations of some candidates; None if a free one displaces no marker."""
+        """Assemble the equations of some candidates.
+
+        None if an unpenalised one has a parameter that displaces no marker.
+        """
         # Penalised ones last: one Cholesky factor holds all determinants.
         candidates = tuple(sorted(candidates, key=lambda candidate: candidate.penalty is not None))
         norms, grams = data.gram_matrices(candidates)
@@ -155,50 +160,76 @@ class System:
         self.of_parameters = packed.length(self.size)
 
     def visible(self) -> bool:
-        """Return whether the unpenalised columns are independent of each other and of the base."""
+        """Return whether the unpenalised columns are independent of each other and of the base.
+
+        The base columns are what the offsets model can absorb.
+        """
         part = self.grams[:, : packed.length(self.unpenalised)].sum(axis=0)
         part[packed.diagonal(self.unpenalised)] += 1e-14
         root, wrong = dpotrf(packed.upper(part, self.unpenalised), overwrite_a=1)
         return not wrong and bool(np.all(np.diag(root)[self.p :] > ABSORBED))
 
     def noise(self, eta: FloatArray) -> Noise:
-        """Return the noise of the coordinates eta."""
+        """Return the noise at some coordinates.
+
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        """
         count = len(self.model.channels)
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
     def value(self, eta: FloatArray) -> float:
-        """Return L, the restricted log likelihood; ``eta``: logs of sigmas, shares, smoothness."""
+        """Return the restricted log likelihood L (see the module), with the Gaussian priors.
+
+        ``eta``: logs of sigmas, of sigmas of common parts, and of smoothness factors, (e,).
+        Raises numpy.linalg.LinAlgError if H is not positive definite.
+        """
         weights, factors = self._precisions(eta)
         total, factor, beta = self._solved(eta)
         value = self._likelihood(total, weights, beta) - np.sum(np.log(np.diag(factor.root)))
         return float(value + self._smooth(factors, beta))
 
     def marginal(self, eta: FloatArray) -> float:
-        """Return L with the normalised prior of the unpenalised parameters, too."""
+        """Return the log likelihood L plus the log normalisation of the parameters' prior.
+
+        Of the unpenalised parameters, with their Gaussian prior.
+
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        """
         prior = self.ridge[self.p : self.unpenalised]
         return self.value(eta) + 0.5 * float(np.sum(np.log(prior)))
 
     def most_likely(self, start: Mapping[object, float], noise: Noise | None) -> FloatArray:
-        """Return the noise and smoothness, as logarithms, that maximise L.
+        """Return the coordinates eta, logs of noise and smoothness, that maximise L, (e,).
 
-        ``start``: smoothness of candidates by key, and noise, to begin at.
+        ``start``: smoothness of candidates by key, and ``noise``: to begin at; others, or
+        None, begin at a first guess.
         """
         return self._most_likely(*self._start(start, self.guess if noise is None else noise))
 
     def factors(self, eta: FloatArray) -> dict[object, float]:
-        """Return the smoothness of each penalised candidate, by key."""
+        """Return the smoothness factor of each penalised candidate, by its key.
+
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        """
         values = np.exp(eta[len(self.entering) :])
         return {
             self.candidates[i].key: float(v) for i, v in zip(self.penalised, values, strict=True)
         }
 
     def estimate(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean (size,) and covariance (size, size) of base and parameters."""
+        """Return posterior mean (size,) and covariance (size, size) of all parameters.
+
+        First the coefficients of the offsets model's columns, then the candidates' parameters.
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        """
         _, cholesky, beta = self._solved(eta)
         return beta / self.unit, _covariances(cholesky, self.unit, 0)[0]
 
     def derivatives(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the gradient of L and its average information."""
+        """Return gradient (e,) and average information (e, e) of the log likelihood L by eta.
+
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        """
         count = len(self.entering)
         weights, factors = self._precisions(eta)
         total, cholesky, beta = self._solved(eta)
@@ -250,12 +281,17 @@ class System:
         return slope, information
 
     def _precisions(self, eta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the weight of each error group, and the factor of each penalty."""
+        """Return the precision of each error group, and each penalised candidate's smoothness."""
         count = len(self.entering)
         return 1.0 / (np.exp(2.0 * eta[:count]) @ self.entering), np.exp(eta[count:])
 
     def _solved(self, eta: FloatArray) -> tuple[FloatArray, _Cholesky, FloatArray]:
-        """Return the weighted sum of the Gram matrices, `packed`, H, and the estimate."""
+        """Return the weighted sum of the Gram matrices, the factor of H, and the estimate.
+
+        The sum is `packed`. H: posterior precision of all parameters; the estimate is in
+        scaled columns, (size,). Raises numpy.linalg.LinAlgError if H is not positive definite.
+        The last result is kept.
+        """
         if self._last is not None and np.array_equal(self._last[0], eta):
             return self._last[1]
         weights, factors = self._precisions(eta)
@@ -275,7 +311,10 @@ class System:
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
-        """Return the fit at the maximum of L; ``prior``: log prior of its candidates."""
+        """Return the fit at the maximum of L; ``prior``: log prior added to its evidence.
+
+        The search begins at the noise and smoothness of ``start``, if given.
+        """
         known = {} if start is None else start.factors()
         noise = self.guess if start is None else start.noise
         eta = self._most_likely(*self._start(known, noise))
@@ -297,7 +336,10 @@ class System:
         )
 
     def _most_likely(self, eta: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Return the noise and smoothness, as logarithms, that maximise L."""
+        """Return the coordinates eta that maximise L between two bounds, by Newton steps, (e,).
+
+        Ends after `STEPS` steps, or if the next one promises little.
+        """
         value = self.value(eta)
         for _ in range(STEPS):
             slope, information = self.derivatives(eta)
@@ -328,21 +370,29 @@ class System:
         factors: FloatArray,
         beta: FloatArray,
     ) -> float:
-        """Return L with ½ log N for each unpenalised parameter in place of its determinant."""
+        """Return L with ½ log N for each unpenalised parameter in place of its determinant.
+
+        The Bayesian information criterion for these. ``total``: weighted Gram matrix,
+        `packed`; ``root``: Cholesky factor of H; ``weights``, ``factors``: as of
+        `_precisions`; ``beta``: the estimate.
+        """
         logs = np.log(np.diag(root))
         value = self._likelihood(total, weights, beta) - logs[: self.p].sum()
         value -= 0.5 * (self.unpenalised - self.p) * np.log(self.model.freedom.sum() - self.p)
         return float(value - logs[self.unpenalised :].sum() + self._smooth(factors, beta))
 
     def _likelihood(self, total: FloatArray, weights: FloatArray, beta: FloatArray) -> float:
-        """Return the log likelihood at an estimate, with the priors but the smoothness."""
+        """Return the log likelihood at an estimate, with all priors except the smoothness."""
         error = np.append(-beta, 1.0)
         square = error @ dspmv(len(error), 1.0, total, error)
         value = 0.5 * self.model.freedom @ np.log(weights) - 0.5 * square
         return float(value - 0.5 * self._implausible(beta))
 
     def _smooth(self, factors: FloatArray, beta: FloatArray) -> float:
-        """Return the log density of the penalised parameters by their smoothness."""
+        """Return the log prior density of the penalised parameters by their smoothness.
+
+        ``factors``: of each penalty; ``beta``: the estimate, (size,).
+        """
         value = 0.0
         for index, penalty, spectrum, ridge, factor in zip(
             self.penalised, self.penalties, self.spectra, self.ridges, factors, strict=True
@@ -360,7 +410,11 @@ class System:
     def _start(
         self, known: Mapping[object, float], noise: Noise
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the start of the search for noise and smoothness, with lower and upper bounds."""
+        """Return the start of the search for noise and smoothness, and its bounds, (e,) each.
+
+        Lower, then upper bounds. ``known``: smoothness by key of candidates, others begin at a
+        typical one; ``noise``: to begin at.
+        """
         sigma = np.log(np.maximum(noise.sigma, RESOLUTION_M))
         least = 0.1 * noise.sigma
         shared = self.model.shared(
@@ -386,7 +440,10 @@ class System:
         return np.clip(eta, low, high), low, high
 
     def _typical(self, which: int, noise: Noise) -> float:
-        """Return the smoothness factor at which penalty and data have about equal weight."""
+        """Return the smoothness factor at which penalty and data have about equal weight.
+
+        ``which``: number of the candidate among the penalised ones.
+        """
         where = self.where[self.penalised[which]]
         diagonal = self.grams[:, packed.diagonal(self.size)[where]].sum(axis=1)
         data = diagonal @ (1.0 / self.model.variances(noise))
@@ -395,24 +452,24 @@ class System:
 
 @dataclass(frozen=True, eq=False)
 class _Cholesky:
-    """A positive definite matrix by its upper Cholesky factor, zeros below the diagonal."""
+    """Positive definite matrix, stored as its upper Cholesky factor, zeros below the diagonal."""
 
     root: FloatArray
 
     @cached_property
     def inverse(self) -> FloatArray:
-        """The inverse, with zeros below the diagonal."""
+        """Upper triangle of the inverse of the matrix, zeros below the diagonal."""
         return np.asarray(dpotri(self.root)[0])
 
     def solve(self, right: FloatArray) -> FloatArray:
-        """Return the product of the inverse and columns."""
+        """Return the solution of the matrix with right-hand sides, (size,) or (size, r)."""
         return np.asarray(cho_solve((self.root, False), right, check_finite=False))
 
 
 def _covariances(H: _Cholesky, unit: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance by H, scaled by `unit`, and that of its first parameters alone.
+    """Return the covariance of all parameters, and that of the first ones given all others.
 
-    The latter is conditional: all other parameters are known.
+    Inverses of H and of its first block, divided by the scales ``unit``, (size,).
     """
     full = H.inverse + H.inverse.T
     np.einsum('ii->i', full)[:] *= 0.5
@@ -423,7 +480,7 @@ def _covariances(H: _Cholesky, unit: FloatArray, first: int) -> tuple[FloatArray
 
 
 def _step(slope: FloatArray, information: FloatArray) -> FloatArray:
-    """Return Newton's step up a slope, at most `STRIDE` long in each principal direction."""
+    """Return Newton's step for a gradient, at most `STRIDE` long along each eigenvector."""
     values, vectors = np.linalg.eigh(information)
     along = (vectors.T @ slope) / np.maximum(values, SHORTEST)
     step: FloatArray = vectors @ np.clip(along, -STRIDE, STRIDE)

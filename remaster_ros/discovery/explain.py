@@ -62,7 +62,7 @@ class Parameter(Struct, frozen=True):
 
 
 class LookAlike(Struct, frozen=True):
-    """Another cause that explains the data nearly as well."""
+    """Another cause that models have in the place of a found one, as discovery.json has it."""
 
     # As of an effect
     name: str
@@ -76,7 +76,10 @@ class LookAlike(Struct, frozen=True):
 
 
 class FoundEffect(Struct, frozen=True):
-    """A cause, as discovery.json has it; what has a default is missing in files of others."""
+    """Cause found in a session, as discovery.json has it.
+
+    Fields with a default are missing in files of other versions.
+    """
 
     name: str
     joints: tuple[int, ...]
@@ -110,9 +113,11 @@ class FoundEffect(Struct, frozen=True):
     def sampled(
         self, result: FitResult, group: Sequence[Candidate] = (), data: Residuals | None = None
     ) -> FoundEffect:
-        """Return the effect with parameters of the extended model's posterior.
+        """Return a copy of the effect with a sampled fit's parameters and a complete sentence.
 
-        With its candidates and the rows that they were fitted to, its sizes as well.
+        ``result``: the sampled fit; ``group``, ``data``: the effect's candidates and the
+        residuals they were fitted to: if given, its sizes are set, too. The sentence gets the
+        sizes, and a warning unless the cause is certain.
         """
         found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
@@ -147,9 +152,10 @@ class FoundEffect(Struct, frozen=True):
         return replace(found, cause=f'{found.cause} {doubt}', remedy=_later(found.remedy))
 
     def _clear_sizes(self, group: Sequence[Candidate]) -> tuple[str, ...]:
-        """Return the sizes that exceed their uncertainty, and a count of the others.
+        """Return the sizes of the candidates that are clearly not zero, and a count of the others.
 
-        All of them if none does.
+        Clearly: a parameter of at least `CLEAR` standard deviations. All sizes if that is none
+        or all of them. ``group``: the effect's candidates, in the order of its sizes.
         """
         sigmas = {
             parameter.name: abs(parameter.value) / parameter.std
@@ -170,7 +176,7 @@ class FoundEffect(Struct, frozen=True):
 
     @property
     def sigmas(self) -> float:
-        """Largest |value| / std among the parameters."""
+        """Largest |value| / std among the parameters; infinite if none has a std above 0."""
         return clearest((parameter.value, parameter.std) for parameter in self.parameters)
 
     @property
@@ -180,9 +186,9 @@ class FoundEffect(Struct, frozen=True):
 
     @property
     def is_taken_out(self) -> bool:
-        """Whether results to be loaded are fitted with this effect, as an error of measurement.
+        """Whether fits for the controller remove this effect: a certain error of the measurement.
 
-        Where it may be nothing, lengths and offsets that imitate it may be right.
+        An uncertain one stays, as lengths and offsets that imitate it may be right.
         """
         return self.of_measurement and self.is_certain
 
@@ -193,11 +199,15 @@ def clearest(parameters: Iterable[tuple[float, float]]) -> float:
 
 
 def _later(remedy: str) -> str:
+    """Return a remedy put off: 'Measure more poses first. If it stays: …'; '' for ''."""
     return f'Measure more poses first. If it stays: {remedy}' if remedy else ''
 
 
 def with_sizes(cause: str, sizes: Sequence[str]) -> str:
-    """Return the sentence of a cause with its sizes inserted before the first full stop."""
+    """Return the sentence of a cause with its sizes inserted before the first full stop.
+
+    The sentence as it is if there are no sizes.
+    """
     if not sizes:
         return cause
     first, stop, remainder = cause.partition('. ')
@@ -207,7 +217,11 @@ def with_sizes(cause: str, sizes: Sequence[str]) -> str:
 def describe(
     walk: Walk, progress: Callable[[float], None]
 ) -> tuple[tuple[tuple[Candidate, ...], ...], tuple[FoundEffect, ...]]:
-    """Return the candidates of the best model by causes, and the causes, the largest first."""
+    """Return the causes of a walk's best model: their candidates, and their descriptions.
+
+    The largest first. Causes that may be noise with memory are left out. ``progress``: called
+    with the share done.
+    """
     data, solution = walk.data, walk.best
     groups = [group for group in grouped(walk.claimed) if not _may_be_memory(walk, group)]
     groups.sort(key=lambda group: -size_of(data, solution, group))
@@ -220,9 +234,10 @@ def describe(
 
 
 def _may_be_memory(walk: Walk, group: tuple[Candidate, ...]) -> bool:
-    """Return whether a cause is no more likely than not by the readings that are independent.
+    """Return whether a cause may be noise with memory, which looks like what changes as slowly.
 
-    Noise that remembers looks like whatever changes as slowly.
+    So if it gains no log posterior when only the independent share of the readings counts.
+    False for structure that is no cause, and if all readings are independent.
     """
     share = walk.independent_share
     is_cause = EFFECTS[group[0].name].is_cause
@@ -230,7 +245,11 @@ def _may_be_memory(walk: Walk, group: tuple[Candidate, ...]) -> bool:
 
 
 def grouped(candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
-    """Return the candidates of each cause together, in the order of their first."""
+    """Return the candidates that are one cause as tuples, in the order of their first members.
+
+    Such candidates agree in name, driver, form, subject, and time of a change; and in joints
+    and variant as the effect's `cause_per` demands.
+    """
     groups: dict[tuple[str, ...], list[Candidate]] = {}
     for candidate in candidates:
         key: tuple[str, ...] = (
@@ -249,9 +268,9 @@ def grouped(candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
 
 
 def _described(walk: Walk, group: tuple[Candidate, ...], share: float) -> FoundEffect:
-    """Effect of a group of candidates, which are one cause, for the report.
+    """Description of a cause for the report.
 
-    ``share``: as in `FoundEffect`.
+    ``group``: its candidates in the best model; ``share``: as in `FoundEffect`.
     """
     data, solution, first = walk.data, walk.best, group[0]
     wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
@@ -318,14 +337,21 @@ def _also_called(alike: Sequence[LookAlike]) -> str:
 
 
 def _joints(group: Sequence[Candidate]) -> tuple[int, ...]:
-    """Joints of a group of candidates: in their order if all have the same, else sorted."""
+    """Return the joints (1-based) of a group of candidates.
+
+    In their own order if all candidates have the same, else all joints of the group, sorted.
+    """
     if len({candidate.joints for candidate in group}) == 1:
         return group[0].joints
     return tuple(sorted({joint for candidate in group for joint in candidate.joints}))
 
 
 def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple[LookAlike, ...]:
-    """Return the other causes that models have in the place of a group, the likeliest first."""
+    """Return the other causes that models have in the place of a group, the likeliest first.
+
+    ``gain``: log posterior gained by the group. One for each name and joints; causes with a
+    probability below `MENTIONED` are left out.
+    """
     candidate, own_chance = group[0], max(walk.probability_of(candidate) for candidate in group)
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
     for other, chance in walk.instead_of(group).items():
@@ -348,7 +374,11 @@ def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple
 
 
 def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
-    """Return whether two candidates displace the marker alike in every row."""
+    """Return whether two candidates displace the marker alike, up to their parameters' values.
+
+    Compared over the rows worked on, after absorption by the offsets model. False if driver or
+    number of parameters differ, or if a parameter displaces nothing.
+    """
     if candidate.size != other.size or candidate.driver != other.driver:
         return False
     base = data.base.reshape(3 * len(data), -1)
@@ -366,7 +396,7 @@ def _same(data: Residuals, candidate: Candidate, other: Candidate) -> bool:
 
 
 class LessLikely(Struct, frozen=True):
-    """A cause that some models have and that is not named.
+    """Cause that some models of the walk have and that is not named, with its probability.
 
     Its probability is below one half unless ``why`` has the reason.
     """
@@ -379,10 +409,11 @@ class LessLikely(Struct, frozen=True):
 
 
 class SearchRecord(Struct, frozen=True):
-    """Agreement of the walk's chains, as discovery.json has it.
+    """Agreement of the chains of the search for causes, as discovery.json has it.
 
-    ``log_posterior``: of the best model of each chain, from the offsets alone and from all kinds
-    of errors on; ``models``: models of a share worth mentioning; ``best_share``: of the best.
+    ``log_posterior``: of the best model of each chain, from the offsets alone and from all
+    kinds of errors on; ``models``: models of a share worth mentioning; ``best_share``: of the
+    best.
     """
 
     log_posterior: tuple[float, ...]
@@ -392,7 +423,10 @@ class SearchRecord(Struct, frozen=True):
 
     @classmethod
     def of(cls, walk: Walk, named: Sequence[tuple[Candidate, ...]]) -> SearchRecord:
-        """Return the record of a walk, with the likelier causes that are not among `named`."""
+        """Return the record of a walk, with the likelier causes that are not among `named`.
+
+        ``named``: candidates of each named cause.
+        """
         taken = {at_any_time(candidate) for group in named for candidate in group}
         candidates = {
             identity(candidate): candidate
@@ -429,13 +463,19 @@ class SearchRecord(Struct, frozen=True):
 
 
 def size_of(data: Residuals, solution: Solution, group: Sequence[Candidate]) -> float:
-    """Return the RMS of a cause's displacement after absorption by the offsets model, m."""
+    """Return the RMS displacement by a cause that the offsets model cannot absorb, m.
+
+    Over the rows worked on. ``group``: its candidates, all in ``solution``.
+    """
     wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
     return _size(data, group, [solution.parameters[wheres[candidate]] for candidate in group])
 
 
 def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[FloatArray]) -> float:
-    """RMS displacement by candidates with these parameters, less what the base absorbs, m."""
+    """RMS displacement by candidates that the offsets model cannot absorb, m.
+
+    ``parameters``: values of each candidate's parameters.
+    """
     shift = np.zeros((len(data), 3))
     for candidate, values in zip(group, parameters, strict=True):
         shift += data.columns([candidate]) @ values
@@ -447,7 +487,7 @@ def _size(data: Residuals, group: Sequence[Candidate], parameters: Sequence[Floa
 def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:
     """Return a text on the measurements that distinguish two causes.
 
-    ``same``: whether both displace this marker alike, so that none does.
+    ``same``: whether both displace this marker alike, so that no measurement does.
     """
     if same:
         return (
@@ -462,7 +502,11 @@ def separate_by(candidate: Candidate, other: Candidate, same: bool) -> str:
 
 
 def in_words(group: Sequence[Candidate], context: Context) -> str:
-    """Return the sentence on a cause for a technician, with its open questions."""
+    """Return the sentence on a cause for a technician: what errs, how, and when if at a moment.
+
+    ``group``: its candidates. It says so if gravity may be the cause but the URDF has no
+    masses.
+    """
     first = group[0]
     joints = _joints(group)
     effect = EFFECTS[first.name]
@@ -495,7 +539,12 @@ def in_words(group: Sequence[Candidate], context: Context) -> str:
 
 
 def _when(candidate: Candidate, context: Context) -> str:
-    """Return when a step was: by the clock, since the first row, and between configurations."""
+    """Return when a candidate happened, as text; '' if not at one moment.
+
+    By the clock if times are of the clock, since the first row, and between which
+    configurations: 'at …, 12.0 min after the first reading, between configurations 40 and
+    41,'.
+    """
     if np.isnan(candidate.moment):
         return ''
     configuration, after = context.measurements.configuration, context.elapsed_s > candidate.moment
@@ -512,11 +561,12 @@ def _when(candidate: Candidate, context: Context) -> str:
 def shares(
     data: Residuals, groups: Sequence[tuple[Candidate, ...]], solution: Solution
 ) -> list[float]:
-    """Return the share of the gain in mean square that is lost without each cause.
+    """Return the share of the gain in mean square that is lost without each cause, (groups,).
 
-    Everything else is fitted again, with noise and variances as they are. Two causes that imitate
-    each other lose little each: together the shares need not make 1. On held-out rows where there
-    are any; negative where they are predicted better without it. All 0 where nothing is gained.
+    Everything else is fitted again, with noise and variances as they are. Judged on held-out
+    rows, or on the rows worked on if there are none. Two causes that imitate each other lose
+    little each: the shares need not add up to 1. Negative for a cause without which these rows
+    are predicted better; all 0 if all causes together gain nothing.
     """
     rows = data.context.measurements.is_validation
     if not rows.any():
@@ -532,10 +582,11 @@ def shares(
 
 @dataclass(frozen=True, eq=False)
 class _Parts:
-    """Normal equations for fits of some of the causes, and their residuals in some rows.
+    """Normal equations for fits with only some of the causes, judged by errors in some rows.
 
-    The equations of base and candidates; products of what they displace in the rows to judge, and
-    of the errors there, m²; places of the base columns, and those of each cause.
+    ``H``, ``pull``: equations of the base columns and all candidates; ``gram``: products of
+    their displacements and the errors in the rows to judge, m²; ``base``, ``where``: indices
+    of the base columns and of each cause.
     """
 
     H: FloatArray
@@ -552,7 +603,10 @@ class _Parts:
         solution: Solution,
         rows: BoolArray,
     ) -> _Parts:
-        """Assemble the equations; ``rows``: those to judge by, (all rows,)."""
+        """Assemble the equations; ``rows``: mask of those to judge by, (all rows,).
+
+        ``groups``: candidates of each cause, all in ``solution``.
+        """
         p, candidates = data.base.shape[2], solution.candidates
         joined = (data.base, data.columns(candidates), data.errors[:, :, None])
         white = data.noise_model.whitened(np.concatenate(joined, axis=2), solution.noise)
@@ -579,7 +633,10 @@ class _Parts:
         return cls(H, pull, gram, np.arange(p), where)
 
     def left(self, causes: set[int]) -> float:
-        """Return the sum of squares that the fit of some causes leaves, m²."""
+        """Return the sum of squared errors in the rows to judge with only some causes, m².
+
+        ``causes``: their indices; candidates that belong to no cause are left out, too.
+        """
         chosen = np.concatenate((self.base, *(self.where[index] for index in sorted(causes))))
         H, pull = self.H[np.ix_(chosen, chosen)], self.pull[chosen]
         # In units of each parameter's own: those of rad and of m/s differ by ten decades.

@@ -23,9 +23,9 @@ GROSS = 7.0
 
 
 class Gain(Struct, frozen=True):
-    """RMS of the 3-D error over all validation rows, m, as discovery.json has it.
+    """RMS of the 3-D error over all validation rows, before and after, as discovery.json has it.
 
-    None without such rows.
+    The errors are None without such rows.
     """
 
     # With offsets only, and with the effects
@@ -47,9 +47,10 @@ def gain_of(
     fit: FitResult,
     rng: np.random.Generator,
 ) -> tuple[Gain, Mapping[str, Any]]:
-    """Errors of held-out rows before and after the sampled fit, noise floor, and metrics.
+    """Return the errors of held-out rows before and after the sampled fit, and their metrics.
 
-    Before is the fit with offsets only. Without held-out rows both errors are None. The metrics
+    ``found``: the fit with offsets only (before); ``solution``: gives the noise floor;
+    ``fit``: the sampled fit (after). Without held-out rows both errors are None. The metrics
     are 'relative' and 'post_registration' as in fit.json; {} without held-out rows.
     """
     measurements = found.problem.measurements
@@ -85,28 +86,35 @@ def gain_of(
 
 
 def residuals_of(found: Estimate) -> FloatArray:
-    """Return measured minus modelled position of every row of an estimate, m, (n, 3)."""
+    """Return measured minus modelled position of every row at an estimate's mode, m, (n, 3)."""
     predicted = predicted_rows(found.problem, found.model, found.mode.z)
     return found.problem.measurements.position - predicted
 
 
 def rms(errors: FloatArray, rows: BoolArray) -> float:
-    """Return the RMS of the 3-D error of the given rows, m."""
+    """Return the RMS of the 3-D error of the given rows, m.
+
+    ``errors``: m, (n, 3); ``rows``: mask, (n,), with at least one row.
+    """
     return float(np.sqrt(np.mean(np.sum(errors[rows] ** 2, axis=1))))
 
 
 def pose_common_fraction(data: Residuals, solution: Solution) -> float:
-    """Return the share of the noise's variance that is common to the rows of a pose."""
+    """Return the share of the noise's variance that is common to all rows of a pose.
+
+    Of the noise of ``solution``, over all sensors.
+    """
     noise = data.noise_model.sensor_noise(solution.noise)
     common = np.sum(noise.pose_sigma**2)
     return float(common / np.sum(noise.total**2))
 
 
 def noise_by_range(data: Residuals, solution: Solution) -> dict[str, dict[str, float]]:
-    """Compare errors near and far from each sensor.
+    """Compare the errors of near and far rows of each sensor.
 
-    Returns sensor -> ``near_m`` and ``far_m``, the quartiles of the range; ``far_over_near``, the
-    ratio of the RMS errors beyond them; ``p_value`` of the rank correlation of range and error.
+    Returns sensor -> ``near_m`` and ``far_m``, the quartiles of the distance;
+    ``far_over_near``, the RMS error at or above the upper quartile over that at or below the
+    lower; ``p_value`` of the rank correlation of distance and error.
     """
     rows = data.rows
     length = np.linalg.norm(data.left(solution), axis=1)

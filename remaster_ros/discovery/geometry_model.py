@@ -76,20 +76,20 @@ class GeometryModel:
 
     @property
     def held_out_m(self) -> float:
-        """Mean 3-D error over the rows judged with this geometry, m; NaN without any."""
+        """Mean 3-D error of the rows in `judged` with this geometry, m; NaN if there are none."""
         return mean_length(self.errors[self.judged])
 
     @property
     def drawing_held_out_m(self) -> float:
-        """Mean error of held-out rows by the drawing, m."""
+        """Mean 3-D error of the rows in `judged` with the drawing's geometry, m; NaN if none."""
         return mean_length(self.drawing_errors[self.judged])
 
     @property
     def is_better(self) -> bool:
         """Whether this model predicts held-out poses clearly better than the drawing.
 
-        Each pose counts once, as its rows err together. A tie goes to the drawing: an arm with
-        nothing but offsets gains or loses by chance.
+        Clearly: the mean gain of the poses, each counted once, exceeds two of its standard
+        errors. With fewer than 5 poses a smaller mean error is enough; False without any.
         """
         errors, drawn = (
             np.linalg.norm(vectors[self.judged], axis=1)
@@ -102,12 +102,12 @@ class GeometryModel:
         return bool(gains.mean() > PLAINLY * gains.std(ddof=1) / np.sqrt(len(poses)))
 
     def beside(self, offsets_fit: FitResult, gross: Sequence[int]) -> GeometryModel:
-        """Return this model judged against a fit of the zero-offsets that can be loaded instead.
+        """Return a copy judged against a fit of the zero-offsets that can be loaded instead.
 
         Parameters
         ----------
         offsets_fit
-            Their fit.
+            That fit; its residuals are those of the drawing.
         gross
             ``observation`` of the gross errors, which do not count.
         """
@@ -117,15 +117,17 @@ class GeometryModel:
         )
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
-        """Return standard deviations of offsets, (k,), without the assumption of an exact drawing.
+        """Return standard deviations of the zero-offsets if the arm is not exactly its drawing.
 
-        ``std``: given an exact drawing, (k,).
+        ``std``: if it is, rad or m, (k,). Lengths and tilts count with their prior.
         """
         moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
         return moved
 
     def largest_imitation(self, joint: int) -> tuple[Candidate, float]:
-        """Return which length or tilt of the tolerance moves a joint's offset most, and by what.
+        """Return the length or tilt that moves a joint's zero-offset most, and by how much.
+
+        Each with the size that the drawing's tolerance allows.
 
         Parameters
         ----------
@@ -204,9 +206,11 @@ def _loaded(
     theta: FloatArray,
     causes: Sequence[Candidate],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
-    """Return shifts, turns, zero-offsets and the errors of all rows on an arm with some lengths.
+    """Return shifts, turns, zero-offsets and errors on the arm that fitted candidates describe.
 
-    They were linearised: all else settles on the arm that they make.
+    Everything else is fitted again on that arm. Shapes (k, 3), (k, 3), (k,) and (n, 3).
+    ``theta``: values of the parameters of ``candidates``; ``causes``: errors of the
+    measurement to fit, too. None if that cannot be fitted.
     """
     chain = found.problem.chain
     shifts, turns = np.zeros((2, len(chain), 3))
@@ -233,7 +237,10 @@ def mean_length(errors: FloatArray) -> float:
 
 
 def _fitted(found: Estimate, causes: Sequence[Candidate]) -> Estimate | None:
-    """Return the fit with some causes as parameters; None if they cannot be fitted."""
+    """Return the fit with some causes as further parameters; None if they cannot be fitted.
+
+    ``found`` itself without causes.
+    """
     if not causes:
         return found
     data = Residuals.of(found)
@@ -247,14 +254,16 @@ def _fitted(found: Estimate, causes: Sequence[Candidate]) -> Estimate | None:
 
 
 def _errors(fit: Estimate) -> FloatArray:
+    """Return measured minus modelled position of every row at a fit's mode, m, (n, 3)."""
     predicted = predicted_rows(fit.problem, fit.posterior.model, fit.mode.z)
     return fit.problem.measurements.position - predicted
 
 
 def _without_open_offsets(found: Estimate) -> Estimate:
-    """Return the fit with the zero-offsets at 0 that are known to no better than a degree.
+    """Return the fit with zero-offsets held at 0 that are known to no better than `OPEN_ANGLE`.
 
-    Lengths and tilts linearised at an offset that is not there would be those of another arm.
+    ``found`` itself if there are none. Lengths and tilts linearised at a wrong offset would be
+    those of another arm.
     """
     _, std = offsets_of(found)
     chain = found.problem.chain
@@ -270,7 +279,10 @@ def _without_open_offsets(found: Estimate) -> Estimate:
 
 
 def _lengths(context: Context) -> list[Candidate]:
-    """Candidates along x, y, z of each link's frame, or along the link for an axis it is near."""
+    """Return candidates of a length along each axis of each link's frame.
+
+    Along the link itself in place of an axis that is parallel to it.
+    """
     # A link's own direction is one more where it is none of the axes of its frame.
     candidates = list(link_length.candidates(context))
     per_link = {
@@ -285,11 +297,15 @@ def _lengths(context: Context) -> list[Candidate]:
 
 
 def _tilts(context: Context) -> list[Candidate]:
+    """Return candidates of a tilt of each joint but the first about one axis of its frame."""
     return [candidate for candidate in joint_axis_tilt.candidates(context) if candidate.size == 1]
 
 
 def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
-    """Return the change of the zero-offsets per weight of each member, rad or m per m, (k, m)."""
+    """Return what a unit weight of each length and tilt does to the zero-offsets, (k, m).
+
+    In a fit with offsets alone, rad or m per m. ``families``: of lengths and tilts.
+    """
     free = found.posterior.free
     known = data.full_jacobian[data.rows.source][:, :, free]
     x = found.model.natural(found.mode.z)
@@ -305,7 +321,11 @@ def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) 
 
 
 def _moved(chain: SerialChain, shifts: FloatArray, turns: FloatArray) -> SerialChain:
-    """Return an arm with its joints' origins shifted, m, and turned, rad, (k, 3) each."""
+    """Return a copy of an arm with its joints' origins shifted and turned.
+
+    ``shifts``: m, in the frame of the link before; ``turns``: rotation vectors, rad; (k, 3)
+    each.
+    """
     T_fixed = chain.T_fixed.copy()
     T_fixed[:-1, :3, 3] += shifts
     T_fixed[:-1, :3, :3] = T_fixed[:-1, :3, :3] @ rotation_vector_to_matrix(turns)

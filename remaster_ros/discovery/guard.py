@@ -28,7 +28,7 @@ MOST_HARM = 1.05
 
 
 class Unexplained(Struct, frozen=True):
-    """Structure that no cause explains, as discovery.json has it."""
+    """Error that no cause explains, with its size and the next step, as in discovery.json."""
 
     # Where it shows, and what it follows as far as that is known
     where: str
@@ -39,7 +39,10 @@ class Unexplained(Struct, frozen=True):
 
 
 def suggested(effects: Sequence[FoundEffect]) -> str:
-    """Return causes in a few words, each with its joint, place and minute; '' for none."""
+    """Return the titles of causes as a list in words; '' for none.
+
+    With the minute after the first reading for those that happened at a moment.
+    """
     words = []
     for effect in effects:
         word = sentence_case(effect.title)
@@ -50,7 +53,10 @@ def suggested(effects: Sequence[FoundEffect]) -> str:
 
 
 def is_harmful(gain: Gain) -> bool:
-    """Return whether the causes make the error on held-out poses larger by more than 5 %."""
+    """Return whether causes make the error on held-out poses larger by more than 5 %.
+
+    Without gross errors. False if no poses are held out.
+    """
     # Gross errors, which are there with and without causes, would hide what these do.
     before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
     return before is not None and after is not None and after > MOST_HARM * before
@@ -59,7 +65,11 @@ def is_harmful(gain: Gain) -> bool:
 def harm_of(
     found: Estimate, fit: FitResult, gain: Gain, effects: Sequence[FoundEffect]
 ) -> Unexplained:
-    """Return the unexplained error if causes are discarded because they do harm."""
+    """Return an entry on errors whose suggested causes were discarded because they do harm.
+
+    ``found``: fit with offsets only; ``fit``: sampled fit with the causes; ``gain``: its
+    errors, with held-out rows; ``effects``: the causes.
+    """
     measurements = found.problem.measurements
     rows = measurements.is_validation
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
@@ -97,9 +107,9 @@ def harm_of(
 def unfitted(
     errors: FloatArray, effects: Sequence[FoundEffect], reason: InsufficientDataError
 ) -> Unexplained:
-    """Return the unexplained error if causes cannot be fitted together with all else.
+    """Return an entry on errors whose suggested causes cannot be fitted with all else.
 
-    ``errors``: residuals, m, (n, 3).
+    ``errors``: residuals, m, (n, 3); ``reason``: why they cannot.
     """
     names = suggested(effects)
     return Unexplained(
@@ -116,9 +126,10 @@ def unfitted(
 
 
 def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained:
-    """Return the unexplained error if errors are present, but no cause stands out.
+    """Return an entry on errors that are more than noise, but have no single likely cause.
 
-    Of the model of all kinds of errors, by members; a p-value of gaining as much by chance.
+    ``solution``: fit of all kinds of errors as their members; ``p_value``: of gaining as much
+    by chance.
     """
     kinds: dict[str, list[Candidate]] = {}
     for candidate in solution.candidates:

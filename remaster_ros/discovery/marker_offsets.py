@@ -40,9 +40,10 @@ HIDDEN = 0.1
 def moved_markers(
     found: Estimate, data: Residuals, noise: Noise, causes: Sequence[Candidate]
 ) -> tuple[FoundEffect, ...]:
-    """Return an effect for every marker whose fitted place is beyond its stated accuracy; ().
+    """Return an effect for every marker whose fitted place is beyond its stated accuracy.
 
-    The causes are fitted beside them.
+    () if there is none. ``found``: fit with offsets; ``data``: its residuals; ``causes``:
+    candidates that are fitted beside the markers.
     """
     model, problem = found.model, found.problem
     x = model.natural(found.mode.z)
@@ -83,7 +84,10 @@ def moved_markers(
 
 
 def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
-    """Return priors as wide as the markers' found offsets; None if no marker moved."""
+    """Return marker priors wide enough for the offsets found; None if no marker moved.
+
+    Only the markers of ``moved`` have one, at their stated place.
+    """
     places = {}
     for effect in moved:
         if effect.name == MARKER_OFFSET.name:
@@ -94,10 +98,11 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
 
 
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
-    """Return the covariance due to directions that the data leave open, m², (3, 3).
+    """Return the covariance of a marker's place due to directions that the data leave open.
 
-    A marker moves about as far in them as in the others. Around the last joint's axis it moves on
-    a circle, which changes its radius at second order.
+    m², (3, 3). ``moved``: estimated move, m, (3,); ``place``: stated, in the tool frame, m;
+    ``axes``: orthonormal directions as columns; ``seen``: which of these the data determine.
+    In open directions a move as large as in the others is assumed.
     """
     typical = np.sum(moved**2) / max(1, int(seen.sum()))
     hidden = axes[:, ~seen]
@@ -110,7 +115,7 @@ def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolAr
 
 
 def _projected(basis: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the projection of `columns` on the span of `basis`, which may be dependent."""
+    """Return the projection of columns (r, c) on the span of a basis, which may be dependent."""
     scale = np.linalg.norm(basis, axis=0)
     unit = basis / np.where(scale > 0.0, scale, 1.0)
     # By pivoted QR: the singular values would take three times as long.
@@ -130,9 +135,11 @@ def _effect(
     square: float,
     rank: int,
 ) -> FoundEffect:
-    """Effect of a marker that moved by `moved`, m, (3,), with its covariance, (3, 3).
+    """Description of a marker that is not at its stated place, as a cause.
 
-    ``blind``: axes of the tool along which the poses determine the move only in part.
+    ``moved``: by how much, m, (3,), with its ``covariance``, (3, 3); ``blind``: axes of the
+    tool along which the poses determine the move only in part; ``square``, ``rank``:
+    chi-square of the move and its degrees of freedom.
     """
     effect = MARKER_OFFSET
     cause = effect.sentence.format(subject=the('marker', name))

@@ -55,9 +55,10 @@ def structure_left(
     fit: FitResult,
     located: Sequence[FoundEffect],
 ) -> tuple[tuple[Unexplained, ...], tuple[tuple[int, str], ...]]:
-    """Return all structure that no cause explains, with that located by the search.
+    """Return all structure that no cause explains, and all single gross errors held out.
 
-    And (observation, what is wrong) of every held-out row with a gross error.
+    The former includes ``located``, structure that the search has located. The latter:
+    (observation, what is wrong) of each held-out row with a gross error.
     """
     checks = _Checks(data, solution, fit)
     unexplained = (
@@ -76,7 +77,7 @@ def structure_left(
 
 @dataclass(frozen=True, eq=False)
 class _Checks:
-    """Checks of a session's n rows for errors that no cause explains."""
+    """Checks of a session's n rows, after the search, for errors that no cause explains."""
 
     data: Residuals
     solution: Solution
@@ -84,31 +85,34 @@ class _Checks:
 
     @property
     def errors(self) -> FloatArray:
-        """Measured minus modelled positions in the sensor frames, m, (n, 3)."""
+        """Measured minus modelled positions by the sampled fit, sensor frames, m, (n, 3)."""
         return self.fit.residuals_after
 
     @cached_property
     def limit(self) -> FloatArray:
-        """Length from which on the error of a row is gross, m, (n,)."""
+        """Length above which an error is gross, m, (n,): `GROSS` sigmas of the row's sensor."""
         noise = self.data.noise_model.sensor_noise(self.solution.noise)
         limit: FloatArray = GROSS * noise.total
         return limit[self.data.context.sensor]
 
     @cached_property
     def gross(self) -> BoolArray:
-        """Rows that were set aside, or have an error that large, (n,)."""
+        """Mask of the rows that the fit set aside, or whose error is beyond `limit`, (n,)."""
         left_out = [observation for observation, _ in self.fit.left_out]
         gross: BoolArray = np.isin(self.data.context.measurements.observation, left_out)
         return gross | (np.linalg.norm(self.errors, axis=1) > self.limit)
 
     @cached_property
     def predicted(self) -> FloatArray:
-        """Modelled positions in the sensor frames, m, (n, 3)."""
+        """Modelled positions by the sampled fit, in the sensor frames, m, (n, 3)."""
         return self.data.context.measurements.position - self.errors
 
     @cached_property
     def mispaired(self) -> BoolArray:
-        """Gross rows that lie where the marker was at the configuration before or after, (n,)."""
+        """Mask of the gross rows that lie where the marker was just before or after, (n,).
+
+        At the neighbouring reading of the same sensor and marker, if that is of another pose.
+        """
         measurements = self.data.context.measurements
         at_neighbour = np.zeros(len(measurements), bool)
         for rows in self._series():
@@ -122,7 +126,7 @@ class _Checks:
         return at_neighbour & self.gross
 
     def _series(self) -> Iterator[IntArray]:
-        """Yield the rows of each sensor and marker, in the order of time."""
+        """Yield the row indices of each sensor and marker in the order of time; may be empty."""
         context = self.data.context
         for sensor in range(len(context.sensor_names)):
             for marker in range(len(context.marker_names)):
@@ -130,7 +134,10 @@ class _Checks:
                 yield rows[np.argsort(context.elapsed_s[rows], kind='stable')]
 
     def pairing(self) -> Iterator[Unexplained]:
-        """Readings that belong to another configuration."""
+        """Yield an entry on readings paired with the wrong configuration, if they are significant.
+
+        Nothing if there are fewer than `FEWEST_MISPAIRED`, or chance may explain them.
+        """
         count = int(self.mispaired.sum())
         if count < FEWEST_MISPAIRED:
             return
@@ -158,9 +165,10 @@ class _Checks:
         )
 
     def _share_near(self, row: int) -> float:
-        """Return the share of other poses at which the sensor would have had this reading.
+        """Return the share of the sensor's rows of other poses that are predicted near a reading.
 
-        At least that of one pose.
+        ``row``: index of the reading; near: within its `limit`. One is added to both counts,
+        so it is above 0.
         """
         measurements = self.data.context.measurements
         other_poses = (measurements.sensor == measurements.sensor[row]) & (
@@ -173,7 +181,10 @@ class _Checks:
 
     @cached_property
     def too_many(self) -> BoolArray:
-        """Gross held-out rows, not mispaired, of sensors that have too many of them, (n,)."""
+        """Mask of gross held-out rows, not mispaired, of sensors with too many of them, (n,).
+
+        Too many: more than `LARGEST_SHARE` of the sensor's held-out rows.
+        """
         context, gross = self.data.context, self.gross & ~self.mispaired
         found = np.zeros(len(gross), dtype=bool)
         for index in range(len(context.sensor_names)):
@@ -183,7 +194,7 @@ class _Checks:
         return found
 
     def gross_held_out(self) -> Iterator[tuple[int, str]]:
-        """Yield observation and text of each single gross error among the held-out rows."""
+        """Yield (observation, text) of each gross held-out row, except those in `too_many`."""
         measurements = self.data.context.measurements
         gross = self.gross & measurements.is_validation & ~self.too_many
         for row in np.flatnonzero(gross).tolist():
@@ -191,10 +202,10 @@ class _Checks:
             yield int(measurements.observation[row]), f'held out, off by {1e3 * length:.1f} mm'
 
     def far_off(self) -> Iterator[Unexplained]:
-        """Entry for each sensor with more than a tenth of its held-out rows gross, not mispaired.
+        """Yield an entry for each sensor that has rows in `too_many`.
 
-        Steps among the fitted rows are found by the search. Where held-out poses were measured
-        last, as in many protocols, what was bumped between the two shows in held-out rows alone.
+        Steps among the fitted rows are found by the search. If held-out poses were measured
+        last, a bump between the two shows in held-out rows alone.
         """
         context = self.data.context
         for index, sensor in enumerate(context.sensor_names):
@@ -219,7 +230,10 @@ class _Checks:
             )
 
     def _moved(self, sensor: int) -> str:
-        """Return a sentence on the moment since which a sensor's errors are different, or ''."""
+        """Return a sentence on the moment since which a sensor's errors are different; '' if none.
+
+        ``sensor``: its index. '' without times, too.
+        """
         context = self.data.context
         rows = np.flatnonzero(context.sensor == sensor)
         moved = None
@@ -253,7 +267,10 @@ class _Checks:
         )
 
     def held_out(self) -> Iterator[Unexplained]:
-        """Held-out poses with larger errors than poses that were left out of the fit in turn."""
+        """Yield an entry if held-out poses have larger errors than poses left out of the fit.
+
+        Those are left out in turn and predicted by the others; gross rows do not count.
+        """
         data = self.data
         held_out = data.context.measurements.is_validation & ~self.gross
         found = compared_held_out(data, self.solution, np.flatnonzero(held_out))
@@ -281,7 +298,7 @@ class _Checks:
         )
 
     def beyond_stated(self) -> Iterator[Unexplained]:
-        """Entry for each error beyond the sensor's own statement, or beyond any instrument."""
+        """Yield an entry for each sensor that errs more than it states, or than any instrument."""
         for check in self.fit.noise_checks:
             if check.is_of_no_instrument:
                 yield Unexplained('noise', 'unknown', check.after_m, None, check.no_instrument)
@@ -307,8 +324,9 @@ class _Checks:
 def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
     """Yield an entry for each sensor whose error exceeds its noise, in a session of few poses.
 
-    What all readings of a pose share counts as noise in the model, and takes up what moved between
-    few poses: the scatter within poses does not. With more poses the search tells the two apart.
+    Nothing with `FEWEST_POSES` poses or more, where the search can tell. Noise here is the
+    scatter within poses: errors that all readings of a pose share may be something that
+    changed between poses.
     """
     if len(np.unique(data.context.measurements.pose[data.rows.source])) >= FEWEST_POSES:
         return
@@ -333,12 +351,12 @@ def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
 def errors_by_place(
     data: Residuals, solution: Solution, significance: float
 ) -> Iterator[Unexplained]:
-    """Yield an entry for each sensor whose errors depend on the place, beside found causes.
+    """Yield an entry for each sensor whose errors depend on the place in its frame.
 
-    In the search a field over a sensor's volume has to beat the best of all that is tried. Here
-    the place alone is asked for, one F test a sensor: do polynomials of it up to the second degree
-    explain more of the means of the poses than noise would, beside all that was found? Half a lens
-    that is bent, too little for a cause of its own, shows so.
+    One F test a sensor: do polynomials of the position up to the second degree explain more of
+    the pose means than noise would, beside all causes found? ``significance``: largest p-value
+    that counts. Sensors with a field in the model, or next to no noise, are left out. It shows
+    what is too little for a cause of its own.
     """
     rows, candidates = data.rows, solution.candidates
     parts = [data.base, data.columns(candidates), data.errors[:, :, None], of_position(rows)]
@@ -382,9 +400,10 @@ def errors_by_place(
 def compared_held_out(
     data: Residuals, solution: Solution, source: IntArray
 ) -> tuple[tuple[int, float, float], ...]:
-    """Compare held-out rows (m,) with poses left out of the fit; see `left_out.compared`.
+    """Compare errors of held-out rows with errors of poses left out of the fit in turn.
 
-    Of many rows every second pose, every third, … is.
+    Results as of `left_out.compared`; () without rows. ``source``: indices of the held-out
+    rows, (m,), thinned to evenly spread poses if they are many.
     """
     measurements = data.context.measurements
     source = of_spread_poses(measurements, source)

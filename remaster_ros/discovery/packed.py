@@ -29,14 +29,20 @@ def diagonal(size: int) -> IntArray:
 
 
 def of_rows(rows: FloatArray, first: int) -> FloatArray:
-    """Return the rows from the first on of symmetric matrices, (…, size − first, size), packed."""
+    """Return rows of symmetric matrices in packed form, up to the diagonal, (…, elements).
+
+    ``rows``: the rows from number ``first`` on, (…, size − first, size).
+    """
     size = rows.shape[-1]
     up_to_diagonal = np.arange(size) <= np.arange(first, size)[:, None]
     return rows[..., up_to_diagonal]
 
 
 def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
-    """Add products of columns, (r, size), to a packed matrix, from its row ``first`` on."""
+    """Add the columns' products X'X to a packed matrix in place, from its row ``first`` on.
+
+    ``columns``: X, (r, size).
+    """
     size = columns.shape[1]
     for start in range(first, size, TILE):
         end = min(start + TILE, size)
@@ -45,7 +51,10 @@ def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
 
 
 def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
-    """Return packed matrices (m, length) with rows and columns in some order, (size,), to read."""
+    """Return packed matrices with some rows and columns in a given order, (m, elements).
+
+    ``matrices``: (m, length); ``order``: their indices. Not to be changed: it may be a view.
+    """
     if np.array_equal(order, np.arange(len(order))):
         return matrices[:, : length(len(order))]
     i, j = _half(len(order))
@@ -56,21 +65,25 @@ def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
 
 
 def upper(matrix: FloatArray, size: int) -> FloatArray:
-    """Return the upper half of the first rows of a packed matrix, (size, size), column-major.
+    """Return the first rows and columns of a packed matrix as an upper triangle, (size, size).
 
-    What is below the diagonal is of no meaning.
+    Column-major; elements below the diagonal have no meaning.
     """
     square: FloatArray = dtpttr(size, matrix[: length(size)])[0]
     return square
 
 
 def of_upper(matrix: FloatArray) -> FloatArray:
-    """Return a matrix packed of which only the upper half counts, column-major, (size, size)."""
+    """Return a symmetric matrix in packed form; only its upper triangle counts.
+
+    ``matrix``: column-major, (size, size).
+    """
     half: FloatArray = dtrttp(matrix)[0]
     return half
 
 
 @lru_cache(maxsize=8)
 def _half(size: int) -> tuple[IntArray, IntArray]:
+    """Return row and column of each element of a packed matrix, (length,) each; cached."""
     i, j = np.tril_indices(size)
     return i.astype(np.int32), j.astype(np.int32)

@@ -36,7 +36,7 @@ LEAST_SHARE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Random effects of one kind of error, with one variance for all members."""
+    """Random effects of one kind of error: weights of all its members, with one variance."""
 
     candidate: Candidate  # Of the weights of all members, m, with a penalty of one
     members: tuple[Candidate, ...]  # The candidates that displace a marker
@@ -63,8 +63,9 @@ class Family:
     ) -> Family | None:
         """Make the family of some candidates; None if none of them displaces a marker.
 
-        Its weights have a standard deviation of no less than ``least``, m. ``alike``: candidates
-        whose joints move the marker as much as theirs count to; the members by default.
+        ``least``: lower limit on the standard deviation of its weights, m; ``alike``:
+        candidates whose joints give the lever arm, m/rad, by which added joint angles count;
+        the members by default.
         """
         seen, maps, scales, largest = [], [], [], []
         lever = _lever(data, alike or members)
@@ -114,14 +115,20 @@ class Family:
 
 
 def _lever(data: Residuals, members: Sequence[Candidate]) -> float:
-    """Return the RMS displacement of the marker by a radian of the candidates' joints, m."""
+    """Return the RMS displacement of the marker by a radian of the candidates' joints, m.
+
+    Joints that slide count by the length that stands for a radian; 0 without joints.
+    """
     joints = sorted({member.joints[0] - 1 for member in members if member.place == 'joint_angle'})
     jacobian = (data.part.jacobian * data.part.chain.per_radian)[:, :, joints]
     return float(np.sqrt(np.sum(jacobian**2) / max(1, len(jacobian) * len(joints))))
 
 
 def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[FloatArray]) -> Design:
-    """Columns of a family's members side by side, each weighted by its map."""
+    """Return columns of a family's weights: displacements by its members through their maps.
+
+    ``maps``: from weights to parameters, one for each member.
+    """
     parts = [
         member.columns(context).displacement(context) @ mapping
         for member, mapping in zip(members, maps, strict=True)
@@ -132,11 +139,12 @@ def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[Floa
 def kinds(
     data: Residuals, candidates: Sequence[Candidate], singles: Sequence[Candidate] = ()
 ) -> list[Family]:
-    """Return a family for each effect of some candidates, without members found by themselves.
+    """Return a family for each effect among some candidates.
 
-    Of a joint with several variants those of `Effect.in_family` are members, and of two with a
-    parameter in common the larger. What is drawn from thousands (orders of a gear, moments of a
-    step, what has no name) is no family: with one variance each would be lost among the others.
+    Left out are changes in mid-session, candidates that are of a cause among ``singles`` or
+    share a parameter with these or a larger member, and variants by `Effect.in_family`.
+    Effects drawn from thousands (`Effect.many`: orders of a gear, steps, unnamed) are no
+    family: with one variance each would be lost among the others.
     """
     taken = {name for candidate in singles for name in candidate.parameters}
     taken_places = {(candidate.name, candidate.joints, candidate.subject) for candidate in singles}
@@ -158,9 +166,9 @@ def kinds(
 
 
 def by_members(solution: Solution, families: Sequence[Family]) -> Solution:
-    """Return a solution with its families replaced by their members.
+    """Return a copy of a solution with its families replaced by their members.
 
-    The same fit: each member has the prior that the family gives it.
+    It is the same fit: each member has the prior that the family gives it.
     """
     known = {family.candidate: family for family in families}
     candidates: list[Candidate] = []

@@ -39,24 +39,32 @@ KEPT_GRAMS = 4
 
 
 class Fit(Protocol):
-    """Parameters of candidates, (m,), with the step of the base columns fitted with them, (p,)."""
+    """Protocol of a fit to residuals: its candidates, their parameters, base coefficients.
+
+    m parameters of the candidates, and p coefficients of the columns that the offsets model
+    can absorb.
+    """
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """The candidates."""
+        """Candidates of the fit, in the order of its parameters."""
 
     @property
     def parameters(self) -> FloatArray:
-        """Their parameters, (m,)."""
+        """Values of the candidates' parameters, (m,)."""
 
     @property
     def base(self) -> FloatArray:
-        """Coefficients of the base columns, (p,)."""
+        """Coefficients of the base columns, those that the offsets model can absorb, (p,)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of the offsets model in n rows, sorted by sensor and pose."""
+    """Residuals of the offsets model in n rows worked on, with what that model can absorb.
+
+    Rows are sorted by sensor and pose. Natural parameters of the model are zero-offsets,
+    registrations and markers.
+    """
 
     context: Context  # All rows of the session at the solution of the offsets model
     rows: Rows  # The rows worked on; ``source`` are their indices in the context
@@ -75,12 +83,12 @@ class Residuals:
 
     @classmethod
     def of(cls, found: Estimate) -> Residuals:
-        """Residuals of a fit with offsets at its mode, on the rows that it kept."""
+        """Return the residuals of a fit with offsets at its mode, on the rows that it kept."""
         return cls.at(found, found.mode)
 
     @classmethod
     def at(cls, found: Estimate, mode: Mode) -> Residuals:
-        """Residuals of a fit with offsets at another mode of its model, on the rows it kept."""
+        """Return the residuals of a fit with offsets at another mode, on the rows that it kept."""
         problem, model = found.problem, found.model
         x = model.natural(mode.z)
         context = Context(
@@ -133,7 +141,7 @@ class Residuals:
         )
 
     def holding(self, parameters: IntArray) -> Residuals:
-        """Return the residuals with some natural parameters fixed, so that these absorb nothing.
+        """Return a copy in which some natural parameters are fixed, so that they absorb nothing.
 
         ``parameters``: their columns in ``full_jacobian``.
         """
@@ -148,12 +156,18 @@ class Residuals:
         )
 
     def less(self, shift: FloatArray) -> Residuals:
-        """Return the residuals with displacements subtracted; ``shift``: m, (all rows, 3)."""
+        """Return a copy with displacements subtracted from all errors.
+
+        ``shift``: m, (all rows, 3).
+        """
         full_errors = self.full_errors - shift
         return replace(self, full_errors=full_errors, errors=full_errors[self.rows.source])
 
     def only(self, source: IntArray) -> Residuals:
-        """Return the residuals on other rows; ``source``: their indices among all rows."""
+        """Return a copy that works on other rows; ``source``: their indices among all rows.
+
+        The base columns remain those of the rows before: not orthonormal over the new ones.
+        """
         rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
         rows = rows.along_path(self.path_noise)
         return replace(
@@ -170,7 +184,7 @@ class Residuals:
 
     @cached_property
     def part(self) -> Context:
-        """The context of the rows worked on, in their order.
+        """Context of the rows worked on, in their order.
 
         What the search needs of hundreds of causes is computed on these rows alone.
         """
@@ -178,7 +192,7 @@ class Residuals:
 
     @cached_property
     def _displacements(self) -> dict[Candidate, FloatArray]:
-        """Cache of `columns` by candidate: a search fits few candidates again and again."""
+        """Cache of each candidate's `columns`, m per unit, (n, 3, size); {} at first."""
         return {}
 
     @cached_property
@@ -189,11 +203,15 @@ class Residuals:
 
     @property
     def poses(self) -> int:
-        """Number of poses."""
+        """Number of poses among the rows worked on."""
         return int(self.pose_of_row.max()) + 1
 
     def columns(self, candidates: Sequence[Candidate]) -> FloatArray:
-        """Return displacements by a unit of each parameter in the rows worked on, m, (n, 3, c)."""
+        """Return marker displacements by a unit of each candidate's parameters, (n, 3, c).
+
+        m per unit, in the rows worked on; c: parameters of all candidates in order. (n, 3, 0)
+        for none.
+        """
         kept = self._displacements
         for candidate in candidates:
             if candidate not in kept:
@@ -206,17 +224,19 @@ class Residuals:
 
     @cached_property
     def _grams(self) -> list[tuple[tuple[Candidate, ...], FloatArray, FloatArray]]:
-        """The last sets of `gram_matrices`, each in the order base, errors, candidates.
+        """Cache of the last `gram_matrices`: candidates, norms, packed matrices, latest first.
 
-        A search fits parts of them, and them with a candidate more.
+        In the order base, errors, candidates. A search fits parts of a set, or the set and one
+        candidate more.
         """
         return [((), *self._grams_of((), np.empty((1, 0)), 0))]
 
     def gram_matrices(self, candidates: Sequence[Candidate]) -> tuple[FloatArray, FloatArray]:
-        """Return norms and Gram matrices of the base columns, of candidates, and of the errors.
+        """Return norms and Gram matrices of the columns [base, candidates, errors].
 
-        Norms over all rows, (p + c + 1,); `packed` matrices of each error group of the noise
-        model, with the columns of candidates in their units (`units`), (groups, length), to read.
+        Norms over all rows, (p + c + 1,); a `packed` matrix for each error group of the noise
+        model, (groups, length), with the candidates' columns divided by their `units`. Read
+        only.
         """
         wanted = set(candidates)
         known, norms, grams = max(
@@ -236,7 +256,10 @@ class Residuals:
         return norms[order], packed.picked(grams, order)
 
     def _positions(self, known: Sequence[Candidate], candidates: Sequence[Candidate]) -> IntArray:
-        """Return the columns of base, errors and candidates in Gram matrices of `known`."""
+        """Return the indices of base, errors and some candidates in the Gram matrices of a set.
+
+        ``known``: candidates of that set, in order, with all of ``candidates`` among them.
+        """
         count = self.base.shape[2] + 1
         first = dict(
             zip(known, np.cumsum([count, *(candidate.size for candidate in known)]), strict=False)
@@ -250,7 +273,11 @@ class Residuals:
     def _grams_of(
         self, candidates: Sequence[Candidate], first: FloatArray, known: int
     ) -> tuple[FloatArray, FloatArray]:
-        """Return norms and Gram matrices of base, errors, candidates; of so many columns known."""
+        """Return norms and packed Gram matrices of the columns [base, errors, candidates].
+
+        ``first``: packed matrices of the first ``known`` columns, which are not computed
+        again, (groups or 1, length).
+        """
         p = self.base.shape[2]
         columns = self.base, self.errors[:, :, None], self.columns(candidates)
         joined = np.concatenate(columns, axis=2)
@@ -270,7 +297,10 @@ class Residuals:
         return norms, grams
 
     def displaced(self, candidates: Sequence[Candidate], parameters: FloatArray) -> FloatArray:
-        """Return the displacement by candidates in every row of the session, m, (all rows, 3)."""
+        """Return the displacement by candidates in every row of the session, m, (all rows, 3).
+
+        ``parameters``: of all of them in order, (c,).
+        """
         shift = np.zeros((len(self.context), 3))
         for where, context in self.context.blocks():
             start = 0
@@ -281,12 +311,12 @@ class Residuals:
         return shift
 
     def unexplained(self, fit: Fit) -> FloatArray:
-        """Return the residuals of a fit in every row of the session, m, (all rows, 3)."""
+        """Return the residuals that a fit leaves in every row of the session, m, (all rows, 3)."""
         residuals: FloatArray = self.full_errors - self.full_base @ fit.base
         return residuals - self.displaced(fit.candidates, fit.parameters)
 
     def left(self, fit: Fit) -> FloatArray:
-        """Return the residuals of a fit in the rows worked on, m, (n, 3)."""
+        """Return the residuals that a fit leaves in the rows worked on, m, (n, 3)."""
         explained: FloatArray = (
             self.base @ fit.base + self.columns(fit.candidates) @ fit.parameters
         )
@@ -294,10 +324,10 @@ class Residuals:
 
 
 def units(candidates: Sequence[Candidate], norms: FloatArray) -> FloatArray:
-    """Return the scale of each column of candidates, (c,).
+    """Return the scale by which each column of candidates is divided, (c,).
 
-    The norms of columns; where they are 0, 1. The penalty compares neighbours: one unit for all of
-    a candidate's splines, also for those at the edge, where no row has more than a rounding error.
+    ``norms``: of the columns, (c,), which are the scale; of a penalised candidate the largest
+    one for all its columns, as its penalty compares neighbours. 1 for columns of zeros.
     """
     unit = norms.copy()
     edges = np.cumsum([0, *(candidate.size for candidate in candidates)])
@@ -308,12 +338,18 @@ def units(candidates: Sequence[Candidate], norms: FloatArray) -> FloatArray:
 
 
 def _quadratic(precision: FloatArray, combinations: FloatArray) -> FloatArray:
-    """Return the precision (p, p) of coefficients of combinations (c, p) of parameters (c,)."""
+    """Return the precision (p, p) of coefficients that combine parameters.
+
+    ``precision``: diagonal, of the parameters, (c,); ``combinations``: (c, p).
+    """
     return combinations.T @ (precision[:, None] * combinations)
 
 
 def _orthonormal(jacobian: FloatArray) -> FloatArray:
-    """Return the combinations of columns (n, 3, c) that are orthonormal over the rows, (c, p)."""
+    """Return combinations of a Jacobian's columns that are orthonormal over the rows, (c, p).
+
+    ``jacobian``: (n, 3, c). p is its rank: combinations below rounding are left out.
+    """
     flat = jacobian.reshape(-1, jacobian.shape[2])
     scale = np.linalg.norm(flat, axis=0)
     scale = np.where(scale > 0.0, scale, 1.0)

@@ -16,7 +16,7 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Covariances:
-    """Covariances of a fit, computed when asked for: most fits are compared by evidence alone."""
+    """Covariances of a fit, computed when first asked for."""
 
     # Returns the covariance of everything together, (p + m, p + m), and that of the columns of the
     # offsets model and the unpenalised parameters, were the penalised ones known, (p + u, p + u)
@@ -24,13 +24,16 @@ class Covariances:
 
     @cached_property
     def both(self) -> tuple[FloatArray, FloatArray]:
-        """Both covariances, as returned by `compute`."""
+        """Covariance of base and parameters, and that of the unpenalised if the others are known.
+
+        As returned by `compute`.
+        """
         return self.compute()
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A set of candidates fitted to the residuals."""
+    """Set of candidates fitted to the residuals, with noise, smoothness and log evidence."""
 
     candidates: tuple[Candidate, ...]  # The set; of a fit those with a penalty are last
     parameters: FloatArray  # Of all the candidates in order, SI, (m,)
@@ -44,7 +47,7 @@ class Solution:
 
     @property
     def full_covariance(self) -> FloatArray:
-        """Covariance of base and parameters together, (p + m, p + m)."""
+        """Covariance of the offsets model's coefficients and the parameters, (p + m, p + m)."""
         return self.covariances.both[0]
 
     @property
@@ -53,12 +56,12 @@ class Solution:
         return self.full_covariance[len(self.base) :, len(self.base) :]
 
     def slices(self) -> list[slice]:
-        """Return the slice of each candidate's parameters."""
+        """Return the slice of each candidate's parameters in `parameters`."""
         edges = np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
     def factors(self) -> dict[object, float]:
-        """Return the precision factor of each penalised candidate, by the candidate's key."""
+        """Return the smoothness of each penalised candidate, by the candidate's key."""
         return {
             candidate.key: float(factor)
             for candidate, factor in zip(self.candidates, self.smoothness, strict=True)
@@ -66,12 +69,18 @@ class Solution:
         }
 
     def weight_precisions(self) -> dict[Candidate, float]:
-        """Return the prior precision of all weights of each candidate that is a kind."""
+        """Return the prior precision of the weights of each candidate that is a family.
+
+        Smoothness plus ridge; NaN for candidates without a penalty.
+        """
         first = [where.start for where in self.slices()]
         return dict(zip(self.candidates, self.smoothness + self.ridge[first], strict=True))
 
     def unphysical(self) -> set[int]:
-        """Return the indices of candidates with a parameter of a sign that physics excludes."""
+        """Return the indices of candidates with a parameter of a sign that physics excludes.
+
+        Opposite to their `sign`; set() if there are none.
+        """
         return {
             index
             for index, (candidate, where) in enumerate(

@@ -67,7 +67,11 @@ Model = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A candidate with weights that displace the marker by a metre RMS over the rows worked on."""
+    """Candidate cause with its parameters scaled to weights, which move the marker by 1 m RMS.
+
+    ``map`` leads from weights to parameters. RMS is over the rows worked on; of a penalised
+    candidate all weights together move it so.
+    """
 
     candidate: Candidate
     map: FloatArray  # Parameters of the candidate from the weights, (parameters, weights)
@@ -77,17 +81,20 @@ class Block:
 
     @property
     def size(self) -> int:
-        """Number of weights."""
+        """Number of weights; fewer than parameters if some directions are not seen."""
         return self.map.shape[1]
 
     @property
     def log_prior(self) -> float:
-        """Log prior odds of the block at one level, if its kind is in the model."""
+        """Log prior odds of this candidate at one level, if its effect is in the model already.
+
+        Shared out evenly among the effect's candidates and the block's allowed levels.
+        """
         return -float(np.log(self.candidate.drawn_from * self.allowed.sum()))
 
     @property
     def sign(self) -> int:
-        """Sign of the weight that physics allows; 0 for both signs."""
+        """Sign that physics allows the weight; 0 for both signs, or several weights."""
         return self.candidate.sign if self.size == 1 else 0
 
     def displacement(self, context: Context) -> FloatArray:
@@ -97,10 +104,14 @@ class Block:
 
     @cached_property
     def _weights(self) -> dict[int, Candidate]:
+        """Cache of `weights`: level -> candidate; {} at first."""
         return {}
 
     def weights(self, level: int) -> Candidate:
-        """Return the block's weights as a candidate, with the prior of a level."""
+        """Return the block's weights as a candidate, with the prior std `LEVELS_M[level]`, m.
+
+        The same object at each call.
+        """
         if level not in self._weights:
             self._weights[level] = Candidate(
                 name=self.candidate.name,
@@ -116,7 +127,11 @@ class Block:
 
 
 def blocks_of(data: Residuals, candidates: Sequence[Candidate]) -> list[Block]:
-    """Return the blocks of all candidates that displace a marker."""
+    """Return a block (scaled candidate cause) for each candidate that can matter, in order.
+
+    Left out are candidates of which a parameter (if penalised: all) displaces no marker, or
+    whose plausible size is below the least of `LEVELS_M`.
+    """
     blocks, n = [], len(data)
     for candidate in candidates:
         if not candidate.size:
@@ -146,7 +161,10 @@ def blocks_of(data: Residuals, candidates: Sequence[Candidate]) -> list[Block]:
 
 
 def _largest(data: Residuals, candidate: Candidate) -> float:
-    """Return the RMS displacement by the plausible size of a joint curve, m; else infinity."""
+    """Return the RMS displacement by a joint curve of its largest plausible size, m.
+
+    Infinity if the candidate does not add to a joint's angle, or has no such size.
+    """
     at = candidate.columns(data.part).at
     if at is None or candidate.largest is None:
         return np.inf
@@ -155,7 +173,7 @@ def _largest(data: Residuals, candidate: Candidate) -> float:
 
 
 class Pool:
-    """All blocks with their columns on the rows worked on."""
+    """All blocks (scaled candidate causes) of a search, with columns on the rows worked on."""
 
     def __init__(self, data: Residuals, blocks: Sequence[Block]) -> None:
         self.data = data
@@ -170,7 +188,10 @@ class Pool:
         self.extend(blocks)
 
     def extend(self, blocks: Sequence[Block]) -> None:
-        """Append blocks to the pool, with their columns."""
+        """Append blocks (scaled candidate causes) to the pool, with their columns.
+
+        Nothing is done for an empty sequence, except in an empty pool.
+        """
         if self.blocks and not blocks:
             return
         known = len(self.blocks)
@@ -211,18 +232,23 @@ class Pool:
             self.excluded[index] = np.array(sorted(set().union(*(users[name] for name in names))))
 
     def prior(self, model: Model) -> float:
-        """Return the log prior odds of a model: its blocks', and `KIND_ODDS` for each kind."""
+        """Return the log prior odds of a model, a set of (block, level) pairs.
+
+        The sum of its blocks' log odds, and log(`KIND_ODDS`) for each effect (kind) among
+        them, however many of its blocks the model has.
+        """
         which = [block for block, _ in model]
         present = len(np.unique(self.kind[which]))
         return float(np.sum(self.log_prior[which]) + present * np.log(KIND_ODDS))
 
 
 class Surface:
-    """Log posterior over models, with noise and background fixed.
+    """Log posterior of sets of candidate causes (blocks), with noise and background fixed.
 
-    Columns and errors are whitened, and what the offsets model and the background absorb is taken
-    out: by M with M'M = (I + Z D Z')⁻¹ for the background Z with variances D, and by projection
-    for the flat columns of the offsets model. The weights of a block are turned so that its Gram
+    The background are random effects of all kinds of errors, one variance each. Columns and
+    errors are whitened, and what the offsets model and the background absorb is taken out: by
+    M with M'M = (I + Z D Z')⁻¹ for the background Z with variances D, and by projection for
+    the flat columns of the offsets model. The weights of a block are turned so that its Gram
     matrix is diagonal: their prior is the same in all directions.
     """
 
@@ -268,14 +294,17 @@ class Surface:
         self.extend()
 
     def has(self, noise: Noise, background: Mapping[Candidate, float]) -> bool:
-        """Return whether the surface is that of a noise and a background."""
+        """Return whether the surface was made for exactly this noise and background.
+
+        ``background``: prior std of the weights of each kind of random effects, m.
+        """
         mine, parts = self.noise, ('sigma', 'pose_sigma', 'frame_sigma')
         return self.background == background and all(
             np.array_equal(getattr(mine, part), getattr(noise, part)) for part in parts
         )
 
     def extend(self) -> None:
-        """Add what has been added to the pool."""
+        """Add the columns of blocks that were added to the pool since, if any."""
         known, count = self.columns.shape[1], self.pool.columns.shape[2]
         if count == known:
             return
@@ -303,11 +332,11 @@ class Surface:
         self._rows.clear()
 
     def is_known(self, block: int) -> bool:
-        """Return whether the products of the columns of a block with all are known."""
+        """Return whether `products` of a block have been computed; ``block``: its index."""
         return block in self._rows
 
     def fetch(self, blocks: Sequence[int]) -> None:
-        """Compute the products of the columns of some blocks with all columns, at once."""
+        """Compute `products` of some blocks at once, where not yet known; ``blocks``: indices."""
         new = [block for block in blocks if not self.is_known(block)]
         if not new:
             return
@@ -318,10 +347,10 @@ class Surface:
             self._rows[block] = rows[start:stop]
 
     def products(self, block: int, gains: FloatArray | None = None) -> Single:
-        """Return the products of the columns of a block with all columns, (weights, m).
+        """Return the products of a block's columns with all columns, (weights, m).
 
-        ``gains``: as of a `State`: what is most likely to be asked for next is computed, too, as
-        all columns are read from memory once.
+        ``gains``: of a `State`, (blocks, levels): if given, products of the blocks that gain
+        most are computed, too, as all columns are read from memory once.
         """
         if not self.is_known(block):
             ahead = [block]
@@ -332,22 +361,25 @@ class Surface:
         return self._rows[block]
 
     def gram(self, block: int) -> FloatArray:
-        """Return the products of the columns of a block with each other, (weights, weights)."""
+        """Return the products of a block's columns with each other, (weights, weights)."""
         if block not in self._grams:
             mine = self.columns[:, self.pool.of[block]]
             self._grams[block] = (mine.T @ mine).astype(float)
         return self._grams[block]
 
     def between(self, block: int, model: Sequence[tuple[int, int]]) -> FloatArray:
-        """Return the products of the columns of a block with those of a model, (weights, q)."""
+        """Return the products of a block's columns with those of a model's blocks, (weights, q).
+
+        ``model``: at least one (block, level); q: number of its weights.
+        """
         block_columns = self.pool.of[block]
         rows = [self.products(other)[:, block_columns] for other, _ in model]
         return np.concatenate(rows).T.astype(float)
 
     def _turn(self, columns: Single, first: int) -> None:
-        """Turn the weights of each block to the principal axes of its Gram matrix.
+        """Turn the weights of each block to the principal axes of its Gram matrix, in place.
 
-        ``columns``: those from the index ``first`` on.
+        ``columns``: those from the index ``first`` on, whitened.
         """
         new = self.pool.first >= first
         start, sizes = self.pool.first[new] - first, self.pool.sizes[new]
@@ -371,12 +403,11 @@ class Surface:
 
 
 class State:
-    """Model on a surface, with the gain by each candidate that could be added.
+    """Set of candidate causes (blocks) on a `Surface`: weights, and gain by each further one.
 
-    Products of the columns are those of their residuals beside the model: with the errors
-    (``pull``, (m,)), and with themselves (``square``, (m,)). ``value``: log posterior relative to
-    that of the model of no block. What needs all columns is computed when it is asked for: most
-    models are proposed and refused by their value.
+    ``value``: log posterior relative to that of no block. ``pull``, ``square``: products, with
+    the errors and with themselves, of all m columns after regression on the model's. What
+    needs all columns is computed when it is asked for: most models are refused by their value.
     """
 
     def __init__(
@@ -397,7 +428,7 @@ class State:
 
     @classmethod
     def empty(cls, surface: Surface) -> State:
-        """Return the model of no block."""
+        """Return the state without any block (candidate cause), of value 0."""
         none: Single = np.zeros((0, surface.columns.shape[1]), np.float32)
         return cls(
             surface,
@@ -411,7 +442,7 @@ class State:
 
     @classmethod
     def of(cls, surface: Surface, model: Model) -> State:
-        """Return a model."""
+        """Return the state of a model; ``model``: its blocks, (block, level) each."""
         surface.fetch([block for block, _ in model])
         state = cls.empty(surface)
         for block, level in model:
@@ -420,7 +451,7 @@ class State:
 
     @cached_property
     def regression(self) -> Single:
-        """Regression of all columns on those of the model, (q, m)."""
+        """Coefficients of all m columns on the model's q columns, with their prior, (q, m)."""
         assert self._regression is not None
         found = self._regression(slice(None))
         # Columns and states before are kept no longer.
@@ -428,13 +459,17 @@ class State:
         return found
 
     def regression_of(self, where: IntArray) -> Single:
-        """Return the regression of some columns on those of the model, (q, c)."""
+        """Return the coefficients of some columns on the model's columns, (q, c).
+
+        ``where``: indices of these columns, (c,).
+        """
         if self._regression is None:
             return self.regression[:, where]
         return self._regression(where)
 
     @cached_property
     def _pull_and_square(self) -> tuple[FloatArray, FloatArray]:
+        """Both `pull` and `square`, (m,) each."""
         assert self._products is not None
         found = self._products()
         self._products = None
@@ -442,26 +477,30 @@ class State:
 
     @property
     def pull(self) -> FloatArray:
-        """Products of the columns with the errors, beside the model, (m,)."""
+        """Products of all columns with the errors, after regression on the model's blocks, (m,).
+
+        X'(y - Z w), w: posterior means of the weights of the blocks Z.
+        """
         return self._pull_and_square[0]
 
     @property
     def square(self) -> FloatArray:
-        """Products of the columns with themselves, beside the model, (m,)."""
+        """Squared lengths of all columns after regression on the model's blocks, (m,)."""
         return self._pull_and_square[1]
 
     @cached_property
     def places(self) -> list[slice]:
-        """Slice of the weights of each block of the model."""
+        """Slice of each of the model's blocks in `weights`."""
         ends = np.cumsum([0, *(self.surface.pool.sizes[block] for block, _ in self.model)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
     @cached_property
     def gains(self) -> FloatArray:
-        """Gain in log posterior by adding each block at each level, (blocks, levels).
+        """Gain in log posterior by adding each block of the pool at each level, (blocks, levels).
 
-        Of blocks of several weights by the diagonal of their Gram matrix, until `with_block`
-        has the exact value.
+        Level: prior size of the block's weights, one of `LEVELS_M`. -inf if the block shares a
+        parameter with the model, or its level or sign is not allowed. For a block of several
+        weights by the diagonal of its Gram matrix, until `with_block` sets the exact value.
         """
         pool = self.surface.pool
         precision = LEVELS_M[:, None] ** -2.0
@@ -478,7 +517,7 @@ class State:
 
     @cached_property
     def losses(self) -> FloatArray:
-        """Loss in log posterior by leaving out each block of the model, (blocks of the model,)."""
+        """Loss in log posterior by leaving out each block of the model, (its blocks,)."""
         pool = self.surface.pool
         which = np.array([block for block, _ in self.model], dtype=np.int64)
         levels = LEVELS_M[[level for _, level in self.model]]
@@ -499,7 +538,10 @@ class State:
         return lost
 
     def with_block(self, block: int, level: int) -> State:
-        """Return the model with a block more."""
+        """Return the state with one block more; this one is not changed, but for its exact gain.
+
+        ``block``: index in the pool; ``level``: index in `LEVELS_M`.
+        """
         surface, pool = self.surface, self.surface.pool
         block_columns = pool.of[block]
         between = self.regression_of(block_columns).astype(float)
@@ -545,7 +587,7 @@ class State:
         )
 
     def without(self, position: int) -> State:
-        """Return the model without a block."""
+        """Return the state without one block; ``position``: its index in `model`."""
         out = np.zeros(len(self.weights), bool)
         out[self.places[position]] = True
         middle = np.linalg.inv(self.inverse[out][:, out])
@@ -575,38 +617,43 @@ class State:
 
     @cached_property
     def kinds(self) -> list[int]:
-        """Kind of each block of the model."""
+        """Number of the kind of each of the model's blocks."""
         return [int(self.surface.pool.kind[block]) for block, _ in self.model]
 
     def _prior(self, block: int, there: bool) -> float:
-        """Return the log prior odds of a block; less likely if it is the first of its kind.
+        """Return the log prior odds that a block adds to those of the model.
 
-        ``there``: whether the model has another block of this kind; else log(KIND_ODDS) is added.
+        ``there``: whether the model has another block of this kind; else log(`KIND_ODDS`) is
+        added.
         """
         odds = float(self.surface.pool.log_prior[block])
         return odds if there else odds + float(np.log(KIND_ODDS))
 
     @property
     def columns(self) -> IntArray:
-        """Columns of the blocks of the model, in the order of the weights."""
+        """Indices of the columns of the model's blocks, in the order of `weights`, (q,)."""
         of = self.surface.pool.of
         return np.concatenate([np.zeros(0, np.int64), *(of[block] for block, _ in self.model)])
 
     @property
     def key(self) -> Model:
-        """The model, sorted."""
+        """The model as a key: its (block, level) pairs, sorted."""
         return tuple(sorted(self.model))
 
 
 class Walker:
-    """Random moves of one chain on a surface; notes the log posterior of every model visited."""
+    """Metropolis chain over states of a surface; notes the log posterior of every one proposed."""
 
     def __init__(self, state: State, rng: np.random.Generator) -> None:
         self.state, self.rng = state, rng
         self.seen = {state.key: state.value}
 
     def step(self, heat: float) -> None:
-        """Make one move: a block joins, leaves, is exchanged, or a pair is changed."""
+        """Propose one move and accept or refuse it: a block joins, leaves or is exchanged.
+
+        Or two are changed. Block: a candidate cause. ``heat``: exponent of the posterior, the
+        inverse of a temperature; 1 for the posterior itself, less for wider moves.
+        """
         u, state = self.rng.random(), self.state
         if not state.model or u < 0.25:
             self._add(state, heat)
@@ -626,20 +673,31 @@ class Walker:
                 self._add(more, heat)
 
     def _add(self, state: State, heat: float) -> None:
-        """Propose a drawn block, unless its gain by the diagonal is far too small."""
+        """Propose `state` with one more block (candidate cause) as the chain's next state.
+
+        The block is drawn by its gain in log posterior. Nothing if there is none to add, or if
+        that gain by the Gram matrix's diagonal leaves it over `FAR` below the present log
+        posterior. ``heat``: exponent of the posterior, the inverse of a temperature.
+        """
         drawn = self._draw(state, heat)
         # By the diagonal far worse: the exact gain is hardly ever that much more.
         if drawn is not None and state.value + state.gains[drawn] > self.state.value - FAR:
             self._accept(state.with_block(*drawn), heat)
 
     def _accept(self, state: State, heat: float) -> None:
-        """Move to a model with the probability of Metropolis; note its log posterior."""
+        """Accept or refuse a state as the chain's next one (Metropolis); note its log posterior.
+
+        ``heat``: exponent of the posterior, the inverse of a temperature.
+        """
         self.seen[state.key] = state.value
         if np.log(self.rng.random()) < heat * (state.value - self.state.value):
             self.state = state
 
     def _draw(self, state: State, heat: float) -> tuple[int, int] | None:
-        """Draw a block and its level by gain; None if no block can be added."""
+        """Draw a block (candidate cause) to add, and its level; None if no block can be added.
+
+        With odds exp(heat × gain in log posterior); ``heat``: an inverse temperature.
+        """
         gain = state.gains.ravel()
         top = gain.max()
         if not np.isfinite(top):
@@ -649,7 +707,10 @@ class Walker:
         return divmod(min(index, gain.size - 1), len(LEVELS_M))
 
     def _which(self, state: State, heat: float) -> int:
-        """Draw a block of the model: half by how small its loss is, half evenly."""
+        """Draw one of the model's blocks (causes) to leave out; return its position in the model.
+
+        Half of the probability is by exp(-heat × loss in log posterior), half is even.
+        """
         chance = np.exp(-heat * (state.losses - state.losses.min()))
         chance = 0.5 * chance / chance.sum() + 0.5 / len(chance)
         return int(self.rng.choice(len(chance), p=chance))

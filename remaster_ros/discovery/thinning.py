@@ -34,7 +34,7 @@ FEWEST_ROWS = 2
 
 
 class Thinning(Struct, frozen=True):
-    """Number of rows searched, and errors with the causes on all other rows."""
+    """Number of rows searched for causes, and RMS errors with the causes on all other rows."""
 
     # Rows that were searched, and all that could have been
     searched: int
@@ -53,8 +53,9 @@ def draw_rows(
 ) -> IntArray:
     """Return about `most` of the given rows, drawn evenly over time; all if they are fewer.
 
-    Whole poses are drawn, one of every few consecutive ones that the same sensors measured. Where
-    that would leave few poses, `FEWEST_POSES` are, with fewer rows of each.
+    Whole poses are drawn, one of every few consecutive ones that the same sensors measured. If
+    that would leave fewer than `FEWEST_POSES` of these, so many are drawn, with fewer rows of
+    each. ``rows``: indices; the result is sorted.
     """
     if len(rows) <= most:
         return rows
@@ -81,7 +82,10 @@ def draw_rows(
 
 
 def of_spread_poses(measurements: Measurements, rows: IntArray) -> IntArray:
-    """Return about `MOST_ROWS` of the given rows, of evenly spread poses; all if fewer."""
+    """Return about `MOST_ROWS` of the given rows (indices), of evenly spread poses.
+
+    All rows if they are fewer.
+    """
     pose = np.unique(measurements.pose[rows], return_inverse=True)[1]
     kept = evenly(int(pose.max(initial=-1)) + 1, MOST_ROWS / max(MOST_ROWS, len(rows)))
     return rows[np.isin(pose, kept)]
@@ -90,7 +94,11 @@ def of_spread_poses(measurements: Measurements, rows: IntArray) -> IntArray:
 def judge_by_others(
     data: Residuals, rows: IntArray, searched: IntArray, empty: Solution, solution: Solution
 ) -> Thinning:
-    """Hold the causes, frozen, against the rows that could have been searched, and were not."""
+    """Measure how the causes, as the search fitted them, predict rows that it did not see.
+
+    ``rows``: indices of all rows that could have been searched; ``searched``: those that were;
+    ``empty``, ``solution``: fits without and with the causes.
+    """
     unsearched_rows = np.setdiff1d(rows, searched)
 
     def left(fit: Solution) -> float:
@@ -101,13 +109,16 @@ def judge_by_others(
 
 
 def _one_of_each(count: int, strata: int, rng: np.random.Generator) -> IntArray:
-    """Cut 0 … count − 1 into runs of about equal length and draw one number of each."""
+    """Draw one number from each of `strata` runs of about equal length of 0 … count − 1."""
     edges = np.linspace(0, count, strata + 1).astype(np.int64)
     return edges[:-1] + (rng.random(strata) * np.diff(edges)).astype(np.int64)
 
 
 def _some_of_each_group(group: IntArray, share: float, rng: np.random.Generator) -> IntArray:
-    """Return indices of a share of each group's members, evenly in their order."""
+    """Return sorted indices of a random share of each group's members, evenly in their order.
+
+    ``group``: number of each member's group, (n,). At least `FEWEST_ROWS` of a group, or all.
+    """
     order = np.argsort(group, kind='stable')
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))
     kept = []

@@ -15,7 +15,10 @@ from remaster_ros.types import FloatArray
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
-    """Return a solution's candidates as parameters of the model, linearised at their values."""
+    """Return a solution's candidates as parameters of the model that is sampled.
+
+    Linearised at their values in ``solution``; parameters of motion of the model stay.
+    """
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))
     for candidate, where in zip(solution.candidates, solution.slices(), strict=True):
@@ -50,7 +53,12 @@ def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> E
 
 
 def natural_steps(residuals: Residuals, found: Estimate, base: FloatArray) -> FloatArray:
-    """Return the steps of the natural parameters that the gauge leaves free, of base columns."""
+    """Return the steps of the free natural parameters that base coefficients amount to.
+
+    Natural parameters: zero-offsets, registrations, markers; free: not held fixed by the fit
+    (`found.posterior.free`), rad or m. ``base``: coefficients of the columns that the offsets
+    model can absorb, (p,).
+    """
     free = found.posterior.free
     columns = residuals.full_jacobian[residuals.rows.source][:, :, free].reshape(-1, len(free))
     scale = np.linalg.norm(columns, axis=0)
@@ -62,7 +70,10 @@ def natural_steps(residuals: Residuals, found: Estimate, base: FloatArray) -> Fl
 
 
 def root_of_inverse(precision: FloatArray) -> FloatArray:
-    """Return L with L L' the inverse of a matrix of parameters in units far apart, (P, P)."""
+    """Return L with L L' the inverse of a positive definite matrix, (P, P).
+
+    Its parameters may have units far apart.
+    """
     unit = np.maximum(np.diag(precision), np.finfo(float).tiny) ** -0.5
     scaled = precision * np.outer(unit, unit) + 1e-12 * np.eye(len(precision))
     root: FloatArray = unit[:, None] * np.linalg.inv(np.linalg.cholesky(scaled)).T
@@ -70,7 +81,10 @@ def root_of_inverse(precision: FloatArray) -> FloatArray:
 
 
 def offsets_of(found: Estimate) -> tuple[FloatArray, FloatArray]:
-    """Return the zero-offsets of the fit without effects and their stds, rad, (k,) each."""
+    """Return the zero-offsets of a fit and their standard deviations, rad or m, (k,) each.
+
+    The latter is NaN for offsets that the fit holds fixed, as the data do not determine them.
+    """
     joints = found.model.joints
     std = np.full(joints, np.nan)
     free = found.posterior.free
@@ -80,6 +94,9 @@ def offsets_of(found: Estimate) -> tuple[FloatArray, FloatArray]:
 
 
 def _columns(candidate: Candidate, context: Context) -> tuple[int | None, FloatArray]:
-    """Return joint and values of a candidate's columns in every row of a session."""
+    """Return index of the joint (None if none) and values of a candidate's columns.
+
+    In every row of the session; see `Design`.
+    """
     blocks = [candidate.columns(block) for _, block in context.blocks()]
     return blocks[0].at, np.concatenate([block.values for block in blocks])

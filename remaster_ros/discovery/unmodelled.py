@@ -30,7 +30,7 @@ NOTICEABLE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Unmodelled:
-    """Normal equations of a solution, for the effect of errors that are not in its model.
+    """Normal equations of a solution, and how errors outside its model would move its parameters.
 
     ``found``: fit whose residuals the discovery explains; ``data``: those residuals.
     """
@@ -62,13 +62,14 @@ class Unmodelled:
 
     @property
     def size(self) -> int:
-        """Number of natural parameters and of those of the candidates."""
+        """Number of parameters: natural ones of the fit, then those of the candidates."""
         return int(self.found.model.size + len(self.solution.parameters))
 
     def by_models(self, models: Sequence[tuple[Solution, float]]) -> FloatArray:
         """Return the change of all parameters to each other model, times the root of its share.
 
-        The squares of the columns are the variance among the models.
+        (size, models). The sum of the squares of a row is a variance among the models. A
+        candidate that the other model lacks counts as 0 there.
         """
         first, names = self.solution, _names(self.solution)
         size = self.found.model.size
@@ -123,10 +124,11 @@ class Unmodelled:
         return moves
 
     def by_open_offsets(self) -> FloatArray:
-        """Return the movement by offsets that the prior on steps holds.
+        """Return columns by which zero-offsets move that only the prior on steps holds, (size, c).
 
-        It is no knowledge of the arm: an offset is known no better than by the data and by what is
-        known of any mastering.
+        That prior is no knowledge of the arm: the columns replace it by what is known of any
+        mastering (`OFFSET_STD`). One for each offset whose variance it reduces noticeably; all
+        other parameters move along. Offsets with a stated prior have none.
         """
         found = self.found
         names = found.problem.chain.joint_names
@@ -151,9 +153,10 @@ class Unmodelled:
         return moves
 
     def std_of_offsets(self, moves: Sequence[FloatArray]) -> FloatArray:
-        """Return the std of the zero-offsets with some movements, rad, (k,).
+        """Return the standard deviation of the zero-offsets with some movements added, (k,).
 
-        NaN where the gauge holds them.
+        rad or m; NaN for offsets that the fit holds fixed. ``moves``: columns, (size, c) each,
+        whose squares add to the variance.
         """
         variance = np.full(self.size, np.nan)
         variance[self.where] = np.sum(self.root**2, axis=1)
@@ -162,4 +165,5 @@ class Unmodelled:
 
 
 def _names(solution: Solution) -> list[str]:
+    """Return the names of all parameters of a solution's candidates, in order."""
     return [name for candidate in solution.candidates for name in candidate.parameters]

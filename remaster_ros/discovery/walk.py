@@ -86,7 +86,11 @@ Identity = tuple[str, tuple[int, ...], str, str, str, str]
 
 
 def identity(candidate: Candidate) -> Identity:
-    """Return the identity of a candidate's cause, without moment, order or axis."""
+    """Return what identifies a candidate's cause: candidates that differ in less are one cause.
+
+    Name, joints, place, driver, subject, and '', 'begins' or 'ends'; without moment, order or
+    axis.
+    """
     change = '' if candidate.changes is None else 'ends' if candidate.ends else 'begins'
     return (
         candidate.name,
@@ -99,14 +103,15 @@ def identity(candidate: Candidate) -> Identity:
 
 
 def at_any_time(candidate: Candidate) -> Identity:
-    """Return a candidate's identity, without the moment at which it changes."""
+    """Return a candidate's identity with 'at any time' in place of '', 'begins' or 'ends'."""
     return *identity(candidate)[:-1], 'at any time'
 
 
 def _claims(candidate: Candidate) -> Identity:
-    """Return the identity by which a cause counts as present in a model.
+    """Return the key of `Walk.probability` by which a candidate's cause counts as present.
 
-    What is there from the start is there in a model, too, in which it comes or goes near an end.
+    `at_any_time` for a cause of the whole session, as a model in which it comes or goes near
+    an end has it, too; else `identity`.
     """
     return at_any_time(candidate) if candidate.changes is None else identity(candidate)
 
@@ -114,9 +119,9 @@ def _claims(candidate: Candidate) -> Identity:
 def at_other_moments(
     candidate: Candidate, context: Context, low: float, high: float
 ) -> list[Candidate]:
-    """Return variants of a candidate that happened in gaps between `low` and `high`, s.
+    """Return the same cause at all gaps between configurations from `low` to `high`, s.
 
-    [] for a candidate that did not happen at a moment.
+    [] for a candidate of the whole session. Gaps count that overlap the interval.
     """
     between, changes = EFFECTS[candidate.name].between, EFFECTS[candidate.name].changes
     if candidate.changes is not None and changes is not None:
@@ -139,17 +144,21 @@ def at_other_moments(
 def p_value(log_evidence_gain: float) -> float:
     """Upper bound on the probability of such a gain in log evidence in pure noise.
 
-    Candidates of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one of c
-    candidates of it, the sum of all Bayes factors has the expectation 1 where nothing is there; by
-    Markov's inequality the best raises the log evidence by g with a probability of at most
-    K exp(-g).
+    Candidates of K kinds are tried. With the prior probability 1/K of its kind and 1/c of one
+    of c candidates of it, the sum of all Bayes factors has the expectation 1 in pure noise; by
+    Markov's inequality the best raises the log evidence by g with a probability of at most K
+    exp(-g). At most 1.
     """
     return float(min(1.0, len(EFFECTS) * np.exp(-log_evidence_gain)))
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluated:
-    """Model with noise and background at the maximum of its likelihood."""
+    """Set of candidate causes (blocks) fitted with its own noise and background variances.
+
+    These maximise the restricted likelihood. The background are families of random effects:
+    all errors of one kind, with one variance.
+    """
 
     data: Residuals
     model: Model
@@ -165,7 +174,7 @@ class Evaluated:
 
     @cached_property
     def std(self) -> dict[Candidate, float]:
-        """Prior standard deviation of the weights of each kind of the background, m."""
+        """Prior standard deviation of the weights of each family of random effects, m."""
         return {
             family.candidate: (
                 self.factors[family.candidate.key] + (family.candidate.largest or np.inf) ** -2.0
@@ -176,7 +185,7 @@ class Evaluated:
 
     @cached_property
     def where(self) -> dict[Candidate, slice]:
-        """Slice of the weights of each candidate in `estimate`."""
+        """Slice of each candidate's weights in `estimate`, behind the p base coefficients."""
         p = self.data.base.shape[2]
         edges = p + np.cumsum([0, *(candidate.size for candidate in self.candidates)])
         return {
@@ -185,9 +194,10 @@ class Evaluated:
         }
 
     def log_factor(self, where: IntArray, std: FloatArray) -> float:
-        """Return the log Bayes factor for some weights, by their densities at nothing.
+        """Return the log Bayes factor for some weights not being zero (Savage & Dickey).
 
-        Savage & Dickey: before the data, with their prior standard deviations, over after them.
+        Prior density at zero over posterior density there. ``where``: indices of the weights
+        in `estimate`; ``std``: their prior standard deviations, (len(where),).
         """
         mean, covariance = self.estimate
         weights, spread = mean[where], covariance[np.ix_(where, where)]
@@ -200,14 +210,17 @@ class Evaluated:
         return float(0.5 * worth - np.sum(np.log(std)))
 
     def log_factor_of_kind(self, family: Family) -> float:
-        """Return the log Bayes factor for a kind of the background."""
+        """Return the log Bayes factor for a family of random effects, all its weights together."""
         part = self.where[family.candidate]
         std = np.full(family.candidate.size, self.std[family.candidate])
         return self.log_factor(np.arange(part.start, part.stop), std)
 
     @cached_property
     def members(self) -> list[tuple[Family, Candidate, IntArray, FloatArray]]:
-        """Members of the background: kind, candidate, places of its weights, map from these."""
+        """Members of the background's families: (family, candidate, indices of its weights, map).
+
+        Indices in `estimate`; the map leads from weights to parameters, (parameters, weights).
+        """
         found = []
         for family in self.families:
             start = self.where[family.candidate].start
@@ -219,7 +232,7 @@ class Evaluated:
 
     @cached_property
     def by_itself(self) -> dict[Candidate, float]:
-        """Log Bayes factor of each member of the background by itself."""
+        """Log Bayes factor of each member of the background's families, by its weights only."""
         return {
             member: self.log_factor(where, np.full(len(where), self.std[family.candidate]))
             for family, member, where, _ in self.members
@@ -227,9 +240,10 @@ class Evaluated:
 
     @cached_property
     def standing_out(self) -> dict[Candidate, float]:
-        """Probability that each member of the background is present, given the model.
+        """Probability that each member of the background's families is a cause, given the model.
 
-        The kind has to be there, and among its m causes this one, at odds of 1 to m - 1.
+        The product of two: that its family is present, and that this one of its m causes is,
+        at prior odds of 1 to m. Members of one cause have the same.
         """
         found = {}
         for family in self.families:
@@ -252,9 +266,10 @@ class Evaluated:
 def evaluated(
     pool: Pool, families: Sequence[Family], model: Model, start: Evaluated | None = None
 ) -> Evaluated | None:
-    """Return a model with noise and background at the maximum of its likelihood.
+    """Fit a model at the noise and background variances that maximise its likelihood.
 
-    None if its columns cannot be distinguished.
+    ``families``: the background; ``model``: blocks of ``pool`` with levels; ``start``: where
+    the search begins. None if its columns cannot be distinguished.
     """
     candidates = [pool.blocks[block].weights(level) for block, level in model]
     system = System.of(pool.data, [*candidates, *(family.candidate for family in families)])
@@ -283,9 +298,10 @@ def _has_few_poses(data: Residuals) -> bool:
 
 
 def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]:
-    """Return the kinds of errors that may be beside the causes.
+    """Return the families of random effects that models may have beside their single causes.
 
-    Of few poses none: these tell of no variance more than that of the noise.
+    One for each kind of error. [] for a session of few poses, which tell only the variance of
+    the noise. Families of a single cause are left out, except free forms.
     """
     if _has_few_poses(data):
         return []
@@ -299,7 +315,10 @@ def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]
 
 
 def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
-    """Return the families with each free form (penalised member) as a family of its own."""
+    """Return families of random effects, with each free form as a family of its own.
+
+    Free forms are penalised members, such as splines; other families are unchanged.
+    """
     found = []
     for family in families:
         if family.members[0].penalty is None:
@@ -314,10 +333,10 @@ def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
 
 
 def log_price(families: Sequence[Family]) -> float:
-    """Return the log prior odds of the kinds of a background.
+    """Return the log prior odds of a background, a set of families of random effects.
 
-    A kind pays what the first block of a kind does, and a free form with a variance of its own
-    what a block pays.
+    log(`KIND_ODDS`) for each effect among them, except lengths and tilts; and for a free form
+    with a variance of its own what a single cause costs.
     """
     forms = [family.members[0] for family in families if family.candidate.variant == ALONE]
     each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
@@ -329,14 +348,14 @@ def log_price(families: Sequence[Family]) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """Result of one chain."""
+    """Result of one Metropolis chain: its best model, and the models visited."""
 
     best: Evaluated  # Its best model
     visited: Mapping[Model, float]  # Log posterior of the models of its last round
 
 
 class Walk:
-    """Chains on one set of residuals, and the models they visited with their shares.
+    """Metropolis chains over sets of causes for some residuals, and the models they visited.
 
     Attributes
     ----------
@@ -423,9 +442,9 @@ class Walk:
     def _form_for_shapes(self) -> Evaluated | None:
         """Return a model better than all so far, with a free form in place of its shapes.
 
-        Shapes are blocks of thousands (`Effect.many`) at the form's place and driver, as waves are
-        of a joint's error curve: a chain leaves several of them at once in no move. None if no
-        exchange is better.
+        Shapes are blocks of effects with thousands of candidates (`Effect.many`) at the form's
+        place and driver, such as gear waves for a joint's error curve: a chain never leaves
+        several of them in one move. None if no exchange is better.
         """
         start = best = self._best_found
         for form in self.by_form:
@@ -445,10 +464,10 @@ class Walk:
         return None if best is start else best
 
     def _pair_for_pair(self) -> Evaluated | None:
-        """Return a model better than all so far, with two weak blocks of a best one exchanged.
+        """Return a model better than all so far, with two of a chain's weak blocks exchanged.
 
-        Two causes may be imitated by two others: each move of a chain on the way from these to
-        those leads through models that are too unlikely. None if no exchange is better.
+        Two causes may be imitated by two others: single moves of a chain from these to those
+        lead through models that are too unlikely. None if no exchange is better.
         """
         found = []
         for best in [chain.best for chain in self.chains]:
@@ -471,7 +490,10 @@ class Walk:
         return better
 
     def _likeliest(self, state: State) -> list[tuple[int, int]]:
-        """Return block and level of the causes that gain most beside a model, one of each."""
+        """Return (block, level) of the causes that gain most if added to a state, one block each.
+
+        At most `MOST_FIRST`, the most first.
+        """
         gain = state.gains.max(axis=1)
         causes: dict[Identity, int] = {}
         for block in np.argsort(-gain).tolist():
@@ -481,11 +503,11 @@ class Walk:
         return [(block, int(np.argmax(state.gains[block]))) for block in causes.values()]
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
-        """Add likely changes to the pool; return best models with the most likely change.
+        """Add likely changes in mid-session to the pool; return models with the likeliest one.
 
-        Beside the model and in the place of each of its blocks, also without a wander: that
-        follows whatever changes. Changes are many and hardly ever there: their columns are worked
-        on once and not in every round.
+        For the best model of each chain, with its background and without a sensor's wander,
+        which follows any change: a change is likely if it nearly pays, added or in the place
+        of a block. ``changes``: candidates that begin or end at a moment.
         """
         blocks, found = blocks_of(self.data, changes), []
         for best in [chain.best for chain in self.chains] if blocks else []:
@@ -519,9 +541,12 @@ class Walk:
         return found
 
     def _refined(self) -> bool:
-        """Add candidates near those of the best model; return whether any were added.
+        """Add candidates near those of the best model to the pool; return whether any was added.
 
-        At other moments, and of what has a place that no parameter is.
+        Of a cause that happened at a moment: itself at the gaps between the moments tried
+        before and after it, and, in the gaps nearest to it, the changes of every cause that
+        may change. Of another cause: what `Effect.finer` yields. Standard deviations of
+        moments are set anew.
         """
         best = self._best_found
         context, tried = self.data.part, [block.candidate for block in self.pool.blocks]
@@ -578,9 +603,10 @@ class Walk:
         return added or bool(near_these)
 
     def _spread_of_moments(self, state: State, candidate: Candidate) -> float:
-        """Return the standard deviation of the moment of a cause beside a model, s.
+        """Return the standard deviation of the moment at which a cause happened, s.
 
-        Over all moments that were tried, each for the time that is nearest to it.
+        About the likeliest of all moments tried; each counts by its posterior weight if added
+        to ``state``, and by its distance to its neighbours.
         """
         same = [
             (block.candidate.moment, state.gains[index].max())
@@ -596,10 +622,10 @@ class Walk:
         return float(np.sqrt(np.average((at - middle) ** 2, weights=weight)))
 
     def _changes_near(self, moment: float) -> list[Candidate]:
-        """Return the changes of all causes in the gaps nearest to a moment.
+        """Return changes of all causes that may change, in the `NEAREST` gaps about a moment, s.
 
-        What comes at one moment looks like several steps there; the moments that are tried of each
-        change lie further apart than those of steps.
+        What changes at one moment looks like several steps there, and the moments tried of
+        changes lie further apart than those of steps.
         """
         context = self.data.part
         found = gaps(context)
@@ -613,7 +639,10 @@ class Walk:
         ]
 
     def _again(self, start: Evaluated) -> Evaluated:
-        """Return the model of an earlier walk on these rows."""
+        """Fit the model of an earlier walk to these residuals, by the keys of its candidates.
+
+        Blocks that are not in the pool are left out; `empty` if it cannot be fitted.
+        """
         place, levels = self.pool.place, {}
         for candidate, level in start.blocks:
             if candidate.key in place:
@@ -622,9 +651,10 @@ class Walk:
         return self.empty if again is None else again
 
     def _shown(self, found: Evaluated) -> Evaluated:
-        """Return a model without the kinds of the background that the likelihood does not show.
+        """Return a model without the families of random effects that are not worth their price.
 
-        The half of these that it shows least at a time: one of two that imitate each other stays.
+        By their Bayes factors. The less worth half of these is taken out at a time, and the
+        model fitted again: one of two that imitate each other stays.
         """
         while True:
             worth = [
@@ -642,7 +672,11 @@ class Walk:
             found = fewer
 
     def _surface(self, noise: Noise, background: Mapping[Candidate, float]) -> Surface:
-        """Return the surface of a noise and a background; the one before is of no use then."""
+        """Return the surface of a noise and a background, with all blocks of the pool.
+
+        The last one if it is the same, else a new one in its memory: the last must not be used
+        any more. ``background``: prior std of the weights of each family of random effects, m.
+        """
         last = self._last_surface
         if last is None or not last.has(noise, background):
             last = self._last_surface = Surface(self.pool, noise, background, last)
@@ -650,13 +684,21 @@ class Walk:
         return last
 
     def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
-        """Return a model at its own noise and background; None if it cannot be fitted."""
+        """Fit a model with the families of ``start``, at its own noise; None if it cannot be.
+
+        A model evaluated before is returned as it was.
+        """
         if model not in self._known:
             self._known[model] = evaluated(self.pool, start.families, model, start)
         return self._known[model]
 
     def _chain(self, current: Evaluated, hot: bool, before: Evaluated | None = None) -> Chain:
-        """Walk from a model; in the first round with the noise and the background of another."""
+        """Run a chain from a model in rounds, each at the noise and background of the best so far.
+
+        It ends if a round finds nothing better, also with the background chosen anew. ``hot``:
+        begin at a raised temperature; ``before``: earlier model whose noise and background the
+        first round has.
+        """
         new_background = current is self.bare or before is not None
         for index in range(ROUNDS):
             noise, std = current.noise, current.std
@@ -686,7 +728,10 @@ class Walk:
         return Chain(current, visited)
 
     def _run(self, walker: Walker, hot: bool) -> None:
-        """Walk until no better model was found for a while."""
+        """Make steps of a chain until no better state was found for a while, or `STEPS`.
+
+        ``hot``: with the temperature lowered over the first steps.
+        """
         best, since = -np.inf, 0
         for step in range(STEPS):
             walker.step(min(1.0, 0.3 + step / (0.5 * STEPS)) if hot else 1.0)
@@ -697,7 +742,11 @@ class Walk:
                 break
 
     def _whole(self, model: Model, start: Evaluated | None) -> Evaluated | None:
-        """Return a model with the background chosen anew among all kinds; None if not fitted."""
+        """Fit a model with its families of random effects chosen anew; None if not possible.
+
+        The better of shared variances and one for each free form. ``start``: where the search
+        for noise begins; a model fitted before is returned as it was.
+        """
         if model not in self._wholes:
             tried = [
                 self._shown(found)
@@ -708,9 +757,11 @@ class Walk:
         return self._wholes[model]
 
     def _refitted(self, model: Model, before: Evaluated, new_background: bool) -> Evaluated:
-        """Return a model at its own noise, with members that stand out added as blocks.
+        """Fit a model at its own noise, and add single causes that stand out of its background.
 
-        ``before`` if the model cannot be fitted; ``new_background``: choose it among all kinds.
+        These become blocks as long as that raises the log posterior. ``before`` is returned if
+        the model cannot be fitted; ``new_background``: choose the families of random effects
+        anew.
         """
         if new_background:
             best = self._whole(model, before)
@@ -726,9 +777,10 @@ class Walk:
             best = more
 
     def _swapped(self, found: Evaluated) -> Evaluated | None:
-        """Return a model with background members that stand out added as blocks of its own.
+        """Return a model with background members that stand out added as single causes (blocks).
 
-        None if none stands out, or if the model cannot be fitted.
+        At the level nearest to their size. None if none stands out, or if the model cannot be
+        fitted.
         """
         have = {
             name
@@ -748,7 +800,7 @@ class Walk:
         return self.evaluate(tuple(sorted({*found.model, *more})), found) if more else None
 
     def _weigh(self) -> None:
-        """Compute the shares of the models visited; likely models at their own noise."""
+        """Set `models` and `share` from the models visited, the likely ones at their own noise."""
         pooled: dict[Model, float] = {}
         for chain in self.chains:
             for model, value in chain.visited.items():
@@ -785,8 +837,9 @@ class Walk:
     def independent_share(self) -> float:
         """Share of the readings that count as independent, by the autocorrelation of errors.
 
-        With the correlation r of successive errors, (1 - r) / (1 + r) (Bartlett 1946): what the
-        best model leaves, and what wanders with the sensor. 1 where r may be chance.
+        With the correlation r of successive errors of a sensor and marker, (1 - r) / (1 + r)
+        (Bartlett 1946). Errors: what the best model leaves, with a sensor's wander added. 1 if
+        r may be chance.
         """
         data, best, m = self.data, self.best, self.data.part.measurements
         residuals = data.left(best)
@@ -809,9 +862,10 @@ class Walk:
         return 1.0 if r < 2.0 / np.sqrt(3.0 * len(rows)) else (1.0 - r) / (1.0 + r)
 
     def log_gain(self, causes: Sequence[Candidate], share: float = 1.0) -> float:
-        """Return the loss in log posterior of the best model by leaving out some causes of it.
+        """Return the loss in log posterior of the best model by leaving out some of its causes.
 
-        ``share``: share of the readings that are independent.
+        ``causes``: candidates, of which at least one is in it; ``share``: of the readings that
+        count as independent, by which the Bayes factor is multiplied.
         """
         best, mine = self.models[0], {identity(candidate) for candidate in causes}
         wheres, stds, price = [], [], 0.0
@@ -831,19 +885,20 @@ class Walk:
 
     @cached_property
     def solutions(self) -> list[tuple[Solution, float]]:
-        """All models as solutions in their candidates' parameters, each with its share."""
+        """Each of `models` as a solution in its candidates' parameters, with its share."""
         other_solutions = [self.solution(model) for model in self.models[1:]]
         return [*zip([self.best, *other_solutions], self.share.tolist(), strict=True)]
 
     @cached_property
     def best(self) -> Solution:
-        """The model of the largest share."""
+        """Model of the largest share, as a solution."""
         return self.solution(self.models[0])
 
     def _exchanges(self, best: Evaluated) -> dict[Model, float]:
-        """Return log posteriors of models that are nearly as likely with one block exchanged.
+        """Return models that differ from the best one in one block and are nearly as likely.
 
-        A chain visits few of them, and look-alikes are among these.
+        With their log posterior at the best one's noise. A chain visits few of them, and
+        look-alikes are among these.
         """
         found: dict[Model, float] = {}
         state = State.of(self._surface(best.noise, best.std), best.model)
@@ -862,14 +917,19 @@ class Walk:
         return found
 
     def probability_of(self, candidate: Candidate) -> float:
-        """Return the probability that a cause is there, at any moment or order."""
+        """Return the probability that a candidate's cause is present, by all models.
+
+        At any moment, order or axis; 0 if no model has it. A cause of the whole session also
+        counts in models in which it begins or ends.
+        """
         return self.probability.get(_claims(candidate), 0.0)
 
     @cached_property
     def claimed(self) -> list[Candidate]:
-        """Candidates of `best` whose probability, with their look-alikes', is at least 1/2.
+        """Candidates of `best` whose probability, with that of their look-alikes, is at least 1/2.
 
-        Other forms of a claimed cause, and weaker copies of it by another axis, are left out.
+        Shapes that are part of a free form among them are left out, and weaker copies of a
+        cause by another axis.
         """
         found = []
         best = self.models[0]
@@ -896,7 +956,10 @@ class Walk:
         return found
 
     def _is_part(self, candidate: Candidate, form: Candidate) -> bool:
-        """Return whether a candidate of thousands (`many`) is a part of a free form."""
+        """Return whether a candidate of thousands (`Effect.many`) is part of a free form.
+
+        If it is one of its shapes, and the form reproduces nearly all of its displacement.
+        """
         if not (EFFECTS[candidate.name].many and candidate.is_shape_of(form)):
             return False
         both = [
@@ -907,9 +970,10 @@ class Walk:
         return bool(np.sum(residual**2) < (1.0 - PART_OF_A_CURVE) * np.sum(both[0] ** 2))
 
     def instead_of(self, group: Sequence[Candidate]) -> dict[Candidate, float]:
-        """Return the candidates that models have in place of some causes, with probabilities.
+        """Return candidates that other models have in place of some causes, with probabilities.
 
-        Of models with none of these causes; candidates that the best model lacks.
+        Those of models with none of the causes in ``group``, less candidates that the best
+        model has. {} if all models have one.
         """
         mine = {_claims(candidate) for candidate in group}
         best = {identity(candidate) for candidate in self.named(self.models[0])}
@@ -926,7 +990,10 @@ class Walk:
 
     @cached_property
     def probability(self) -> dict[Identity, float]:
-        """Probability of each cause that some model has, as a block or as a member."""
+        """Probability of each cause that some model has, by `identity` and by `at_any_time`.
+
+        As a block, or as a member of the background that stands out.
+        """
         found: dict[Identity, float] = {}
         for model, share in zip(self.models, self.share, strict=True):
             present: dict[Identity, float] = {}
@@ -938,7 +1005,10 @@ class Walk:
         return found
 
     def present(self, model: Evaluated) -> dict[Candidate, float]:
-        """Return the probability of each candidate of a model to be present, given the model."""
+        """Return the probability that each candidate of a model is a cause, given the model.
+
+        1 for its blocks, `Evaluated.standing_out` for members of its background.
+        """
         blocks = {self.pool.blocks[block].candidate: 1.0 for block, _ in model.model}
         have = {name for candidate in blocks for name in candidate.parameters}
         out = {
@@ -949,14 +1019,14 @@ class Walk:
         return blocks | out
 
     def named(self, model: Evaluated) -> list[Candidate]:
-        """Return the candidates whose probability in a model is at least 1/2."""
+        """Return the candidates of a model that are causes with a probability of at least 1/2."""
         return [candidate for candidate, chance in self.present(model).items() if chance >= 0.5]
 
     def solution(self, model: Evaluated) -> Solution:
-        """Return a model as a solution in its candidates' parameters, blocks with background.
+        """Return a model as a solution: blocks and background in their candidates' parameters.
 
-        A cause that is a member of the background, too, has the sum of both: its size is not
-        shrunk by the variance of its kind.
+        A cause that is both a block and a member of the background has the sum of both: its
+        size is not shrunk by the variance of its family.
         """
         p = self.data.base.shape[2]
         mean, covariance = model.estimate

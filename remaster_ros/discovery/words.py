@@ -44,7 +44,10 @@ MOST_STATED = 0.99
 
 
 def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
-    """Return value, standard deviation and unit of a parameter as text, in usual units."""
+    """Return value, standard deviation and unit of a parameter as texts, in usual units.
+
+    The value has a sign; times of `LONG_S` or more are in minutes.
+    """
     words, times = SHOWN_UNITS.get(unit, (unit, 1.0))
     if unit == 's' and abs(value) >= LONG_S:
         words, times = 'min', 1.0 / 60.0
@@ -52,7 +55,7 @@ def shown(value: float, std: float, unit: str) -> tuple[str, str, str]:
 
 
 def percent(share: float) -> str:
-    """Return a share as whole per cent: '35 %', never '-0 %'."""
+    """Return a share as whole per cent with a typographic minus sign: '35 %'; never '-0 %'."""
     return f'{round(100.0 * share)} %'.replace('-', '−')
 
 
@@ -66,14 +69,17 @@ def probability_text(probability: float | None) -> str:
 
 
 def p_value_text(p_value: float) -> str:
-    """Return 'p = 0.012'; 'p < 0.0001' of what needs no more figures."""
+    """Return a p-value as text: 'p = 0.012', 'p < 0.0001' if below that, 'p unknown' for NaN."""
     if np.isnan(p_value):
         return 'p unknown'
     return f'p < {LEAST_P_VALUE:.4f}' if p_value < LEAST_P_VALUE else f'p = {p_value:.2g}'
 
 
 def clock_time(stamp_s: float) -> str:
-    """Return '08:11:05 UTC on 2026-11-22'; '' for a time that is not counted from 1970 on."""
+    """Return a time as text: '08:11:05 UTC on 2026-11-22'.
+
+    '' if it is not in this age, and so no time since 1970. ``stamp_s``: s since 1970.
+    """
     if not EARLIEST_S < stamp_s < LATEST_S:
         return ''
     return f'{datetime.fromtimestamp(stamp_s, UTC):%H:%M:%S UTC on %Y-%m-%d}'
@@ -82,7 +88,8 @@ def clock_time(stamp_s: float) -> str:
 def titled(candidate: Candidate, joints: Sequence[int]) -> str:
     """Return a heading: 'Link length of joint 2', 'Joint 3 slipped', 'The sensor mocap moved'.
 
-    ``candidate``: the first of a cause; ``joints``: of the whole cause.
+    ``candidate``: the first of a cause; ``joints``: of the whole cause, 1-based, of which a
+    step or unnamed cause names the first. Of a change with its time.
     """
     kind = KIND_OF_SUBJECT.get(candidate.place, '')
     joint = joint_words(joints[:1]) if joints else ''
@@ -108,26 +115,32 @@ def titled(candidate: Candidate, joints: Sequence[int]) -> str:
 
 
 def place_words(candidate: Candidate) -> str:
-    """Return the place of an error: 'joint angle', or 'joint position' of a prismatic joint."""
+    """Return a candidate's place in words: 'joint angle', 'joint position' if the joint slides."""
     return 'joint position' if candidate.slide else candidate.place.replace('_', ' ')
 
 
 def sentence_case(title: str) -> str:
-    """Return a heading as it stands within a sentence."""
+    """Return a heading with its first letter small, as within a sentence."""
     return title[:1].lower() + title[1:]
 
 
 def called(name: str, joints: Sequence[int]) -> str:
-    """Return an effect's name for people: 'link length of joints 2 and 3'."""
+    """Return an effect's name with its joints (1-based): 'link length of joints 2 and 3'.
+
+    The name alone without joints.
+    """
     words = name.replace('_', ' ')
     return f'{words} of {joint_words(joints)}' if joints else words
 
 
 def joint_words(joints: Sequence[int]) -> str:
-    """Return joints as people call them: 'joints 2 and 3'."""
+    """Return joints (1-based) in words: 'joint 2', 'joints 2 and 3'."""
     return f'joint{"s" if len(joints) > 1 else ""} {listed([str(joint) for joint in joints])}'
 
 
 def part_words(name: str, joints: Sequence[int], other: str, of: Sequence[int]) -> str:
-    """Return 'joint 2 alone' if another effect is of the same kind with fewer joints, else ''."""
+    """Return 'joint 2 alone' if another effect has the same name and fewer joints, else ''.
+
+    ``name``, ``joints``: of the effect; ``other``, ``of``: name and joints of the other.
+    """
     return f'{joint_words(of)} alone' if other == name and set(of) < set(joints) else ''

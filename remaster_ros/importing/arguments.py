@@ -39,10 +39,10 @@ _LEFT_OUT = '; to write it as it is, add --unchecked'
 
 
 def in_python(sentence: str, arguments: Collection[str]) -> str:
-    """Sentence with arguments of a function in place of options of the command.
+    """Message of ``remaster import`` with its options replaced by a Python function's arguments.
 
-    `arguments`: those that the function has; other options become ``remaster import --option``.
-    The advice to add --unchecked is taken out.
+    ``--angles deg`` becomes ``angles='deg'``. `arguments`: those that the function has; other
+    options become ``remaster import --option``. The advice to add --unchecked is taken out.
     """
     if 'join' not in arguments:
         sentence = sentence.replace('say --join order', _BY_ORDER)
@@ -59,10 +59,10 @@ def in_python(sentence: str, arguments: Collection[str]) -> str:
 
 
 def remedy(options: str, arguments: Collection[str]) -> str:
-    """Options proposed by `sense`, with their values, as arguments of a function; '' for ''.
+    """Options of ``remaster import``, with values, as arguments of a Python function; '' for ''.
 
-    For example ``couple={'A3': 'A2'}`` of ``--couple A3=A2``. Options that are not among
-    `arguments` are written as ``remaster import --option value``.
+    `options`: text such as ``--couple A3=A2``, which becomes ``couple={'A3': 'A2'}``. Options
+    that are not among `arguments` are written as ``remaster import --option value``.
     """
     words = shlex.split(options)
     found: dict[str, list[str]] = {}

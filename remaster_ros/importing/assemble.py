@@ -58,7 +58,7 @@ _WORDS_OF_KINDS: dict[SensorKind, re.Pattern[str]] = {
 
 @dataclass(frozen=True)
 class SessionOptions:
-    """Options of the command that concern the session."""
+    """Options of ``remaster import`` on the session: joint corrections, marker, held-out share."""
 
     # Corrections by joint column, applied in this order: coupled joint with its sign; columns
     # whose sign is reversed; angles added, degrees
@@ -86,8 +86,9 @@ class SessionOptions:
     ) -> SessionOptions:
         """Options with the joint corrections in the form of the Python functions' arguments.
 
-        `couple`: joint -> joint to be added to it, with a minus sign in front to subtract it;
-        `offset_deg`: joint -> angle to be added, degrees.
+        `couple`: joint -> joint whose angle is added to its own, with a minus sign in front to
+        subtract it; `reverse`: joints whose sign is reversed; `offset_deg`: joint -> angle to
+        be added, degrees. None or () for no such corrections.
         """
         added: dict[str, tuple[str, Literal[1, -1]]] = {
             name: (other.lstrip('+-'), -1 if other[:1] == '-' else 1)
@@ -102,11 +103,12 @@ class SessionOptions:
 
 
 def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) -> Controller | None:
-    """How the controller counts the joints, by the table's columns and the user's corrections.
+    """Unit, sign, zero and coupling by which the robot's controller counts each joint.
 
-    None if it counts them as the URDF does (a bag, or a joint that slides, without corrections).
-    Raises InputError for corrections of an arm with a prismatic joint, of an unknown joint, or of
-    joints that are coupled in a circle.
+    By the table's columns and the user's corrections. None if the controller counts as the
+    URDF does (a bag, or an arm with a prismatic joint, without corrections). Raises InputError
+    for corrections of an arm with a prismatic joint, of an unknown joint, or of joints that
+    are coupled in a circle.
     """
     corrections = options.couple or options.reverse or options.add_deg
     if chain.slides.any():
@@ -146,10 +148,10 @@ def controller_of(rows: RawRows, chain: SerialChain, options: SessionOptions) ->
 
 
 def _joint_index(name: str, rows: RawRows, chain: SerialChain, option: str) -> int:
-    """Index, from 0, of a joint by the name of its column or in the URDF.
+    """Index, from 0, of a joint by the name of its column in the table, else by that in the URDF.
 
-    Columns first, with or without their unit; case is ignored. Raises InputError, with `option`,
-    if there is none.
+    With or without its unit; case is ignored. Raises InputError, which begins with `option`,
+    if there is no such joint.
     """
     for names in (rows.joint_columns, chain.joint_names):
         folded = [known.casefold() for known in names]
@@ -251,10 +253,10 @@ def assemble(
 def _kinds(
     sensors: Sequence[str], rows: RawRows, options: SessionOptions
 ) -> dict[str, SensorKind]:
-    """Kind of instrument of each sensor, by name; sensors of an unknown kind are left out.
+    """Kind of instrument ('camera' or 'tracker') by sensor name; unknown ones are left out.
 
-    By the option, else by words in its name if these are of one kind only, else by whose file it
-    is; else a camera if the sensor is on the tool.
+    That of the options; else by words in the sensor's name, if these are of one kind only;
+    else that of the file's format; else 'camera' if the sensor is on the tool.
     """
     kinds: dict[str, SensorKind] = {}
     for name in sensors:
@@ -269,11 +271,10 @@ def _kinds(
 def with_controller_coupling(
     rows: RawRows, chain: SerialChain, options: SessionOptions
 ) -> tuple[SessionOptions, list[str]]:
-    """Options with the joint coupling of the file's controller if it fits, and a sentence on it.
+    """Options with the joint coupling of the controller that wrote the file, and a sentence on it.
 
-    The URDF may contain the coupling already: the options stay as they are, with [], if the points
-    then fit better without it (from 12 rows on), if there is no coupling, if the user stated one,
-    or if a joint slides.
+    The same options and [] if the file has no coupling, the user stated one, a joint slides,
+    or, with 12 rows or more, the points fit better without it (the URDF may contain it).
     """
     coupling = tuple(rows.coupling.items())
     if options.couple or not coupling or chain.slides.any():
@@ -291,9 +292,9 @@ def with_controller_coupling(
 
 
 def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
-    """Session with angles (q and from_q) shifted by whole turns into the limits.
+    """Session with joint angles (q and from_q) shifted by whole turns into the limits.
 
-    Last result: a sentence on the shifts; '', with the session as it is, if there are none. A
+    Last result: a sentence on the shifts; '', with the session as it is, if no q is shifted. A
     shifted session has no `observations_sha256`, as its rows differ from its file.
     """
     m = session.measurements
@@ -351,9 +352,9 @@ def refuse_outside_limits(rows: RawRows, chain: SerialChain, q: FloatArray) -> N
 def _poses(rows: RawRows, chain: SerialChain, q: FloatArray) -> tuple[IntArray, str]:
     """Index of the pose of each row, (n,), in order of first occurrence, and a sentence on it.
 
-    By the label ``pose``; else a row has the pose of an earlier one if the nominal tool poses
-    differ by less than 2 mm (`SAME_POSE_M`), 5 mrad counting as 2 mm, as the root of the sum of
-    squares.
+    By the label ``pose``; else a row has the pose of an earlier row if the nominal tool poses
+    of both differ by less than 2 mm (`SAME_POSE_M`), 5 mrad counting as 2 mm, as the root of
+    the sum of squares. `q`: positions as the URDF counts them, rad or m, (n, k).
     """
     if 'pose' in rows.labels:
         pose, names = _indices_of_names(rows.labels['pose'])
@@ -383,10 +384,11 @@ def _frames(
     marker: IntArray,
     configuration: IntArray,
 ) -> IntArray | None:
-    """Index of the frame of each row, (n,): rows that a sensor measured at one moment.
+    """Index of the camera frame of each row, (n,): rows that a sensor measured at one time.
 
-    -1 for a row that is alone in its frame. None if all are, if times are unknown, or if a marker
-    is in a frame twice. `moment`: time or number of the reading of each row, (n,).
+    -1 for a row that is alone in its frame. None if every row is alone, if `moment` is None,
+    or if a marker is in a frame twice. `moment`: time, s, or number of the reading of each
+    row, (n,); the others are indices, (n,).
     """
     if moment is None:
         return None
@@ -401,7 +403,8 @@ def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
     """Index of the configuration of each row, (n,), from 0.
 
     By the label ``configuration`` within a pose; else a new one begins where joints or pose
-    change, or where sensor and marker are those of the row before.
+    change, or where sensor and marker are the same as in the row before (so at each row
+    without such labels).
     """
     if 'configuration' in rows.labels:
         labels = list(zip(pose.tolist(), rows.labels['configuration'], strict=True))
@@ -423,9 +426,10 @@ def _splits(
 ) -> tuple[BoolArray, str]:
     """Mask of the held-out rows, (n,), and a sentence on how they were chosen.
 
-    By the label ``split``, else a random pose of each of consecutive runs of poses, as many as the
-    `share` of them. None is held out for a share of 0 or fewer than 12 poses. Raises InputError
-    for an unknown split, or two splits in a pose.
+    By the label ``split`` if the table has it. Else `share` of the poses is held out: the
+    poses in the order measured are cut into so many runs, and `rng` draws one pose of each.
+    None is held out for a share of 0 or fewer than 12 poses. Raises InputError for an unknown
+    split, or two in a pose.
     """
     if 'split' in rows.labels:
         given = [_SPLITS.get(text.strip().lower(), -1) for text in rows.labels['split']]
@@ -464,7 +468,10 @@ def _splits(
 
 
 def _previous_configuration(configuration: IntArray, q: FloatArray) -> FloatArray:
-    """Joints of the last row of the configuration before, (n, k); NaN for the first one."""
+    """Joints of the last row of the configuration before each row's, (n, k).
+
+    NaN for rows of the first configuration. `configuration`: index of each row, (n,).
+    """
     from_q = np.full_like(q, np.nan)
     first = np.flatnonzero(np.diff(configuration, prepend=configuration[0]) != 0)
     for start, end in zip(first, [*first[1:], len(q)]):
@@ -473,6 +480,6 @@ def _previous_configuration(configuration: IntArray, q: FloatArray) -> FloatArra
 
 
 def _indices_of_names(names: Sequence[str]) -> tuple[IntArray, list[str]]:
-    """Index of each name in the order of first occurrence, (n,), and the different names."""
+    """Index of each name, (n,), and the different names in order of first occurrence."""
     index: dict[str, int] = {}
     return np.array([index.setdefault(name, len(index)) for name in names]), list(index)

@@ -68,7 +68,7 @@ def is_bag(path: Path) -> bool:
 
 @dataclass(eq=False)
 class _Topic:
-    """Stamps and values of the messages of one topic."""
+    """Stamps, s, and values of the messages of one topic, in the order read."""
 
     stamps: list[float] = field(default_factory=list)
     values: list[Any] = field(default_factory=list)
@@ -84,10 +84,10 @@ class _Topic:
 
 
 def _place(message: Any, where: str) -> tuple[float, ...]:
-    """Position x, y, z and, for a pose, quaternion x, y, z, w: 3 or 7 numbers.
+    """Position x, y, z and, for a pose or transform, quaternion x, y, z, w: 3 or 7 numbers.
 
-    The quaternion is NaN if its length differs from 1 by over 1e-3. `where`: dotted path to the
-    field, such as ``pose.pose``.
+    The quaternion is NaN if its length differs from 1 by over 1e-3. `where`: dotted path to
+    the field of the message, such as ``pose.pose``.
     """
     for name in where.split('.'):
         message = getattr(message, name)
@@ -103,10 +103,11 @@ def _place(message: Any, where: str) -> tuple[float, ...]:
 
 
 def _places(topic: str, kind: str, message: Any) -> Iterator[tuple[str, Any, tuple[float, ...]]]:
-    """Yield name, header and place, as `_place`, of each place in a message.
+    """Yield name, header and numbers (as `_place`) of each point, pose or transform in a message.
 
-    The name is the topic, the child frame of a transform, or ``topic/name`` of a body or marker.
-    `kind`: type of the message, one of `PLACES` or `SEVERAL`.
+    The name is the topic, the child frame of a transform, or ``topic/name`` of a body or
+    marker. `kind`: type of the message, a key of `PLACES` (one point or pose) or `SEVERAL` (a
+    list).
     """
     if kind in PLACES:
         yield topic, message.header, _place(message, PLACES[kind])
@@ -132,8 +133,9 @@ def read_bag(
 ) -> RawRows:
     """Rows of a bag: the mean point of each sensor at each standstill of the joints, in order.
 
-    Each topic of points, or each name in a message of several, is a sensor. Markers that stay in
-    their place are left out where they come in messages of several.
+    Each topic of points is a sensor, or each name in messages that list several; names whose
+    points hardly move are then left out, unless the user named topics. A bag of
+    robot_calibration has a row for each measurement instead.
 
     Parameters
     ----------
@@ -142,15 +144,17 @@ def read_bag(
     length
         Unit of the points if it is not the metre of ROS; '' for the metre.
     clock_offset_s
-        Offset added to the stamps of the points to have those of the joints; None to find it.
+        Offset, s, added to the stamps of the points to have those of the joints; None to find
+        it.
     links
         Links of the robot, whose transforms the robot computes and no sensor measures.
 
     Raises
     ------
     InputError
-        No such topics or several, no standstill (0.5 s) with a point in it, numbers beyond any arm
-        or sensor, an arm with a prismatic joint, or a damaged bag.
+        No such topics, several with joint states or poses, no standstill (0.5 s) with a point
+        in it, numbers beyond any arm or sensor, an arm with a prismatic joint, or a damaged
+        bag.
     """
     refuse_sliding(chain, path)
     bag = _Bag.of(path, chain, joint_topics, point_topics, length, links)
@@ -173,8 +177,8 @@ def read_streams(
 ) -> tuple[Stream, list[MarkerStream], dict[str, str]]:
     """Read the joint states and marker positions of a bag, as they were recorded.
 
-    Topics whose first parts are the same, and the names in messages of several, are markers of one
-    sensor.
+    Topics with the same first part, and the names in messages that list several, are markers
+    of one sensor.
 
     Parameters
     ----------
@@ -186,12 +190,14 @@ def read_streams(
     Returns
     -------
     Stream, list of MarkerStream, dict
-        Joint positions, rad, (n, k); positions of each marker, m; column or topic -> meaning.
+        Joint positions, rad, (n, k); positions of each marker, m; topic or name -> meaning in
+        words.
 
     Raises
     ------
     InputError
-        No such topics, a bag of single measurements, or a damaged bag.
+        No such topics, several with joint states or poses, numbers beyond any arm or sensor, a
+        bag of robot_calibration (single measurements), or a damaged bag.
     """
     bag = _Bag.of(path, chain, joint_topics, point_topics, length, links)
     if isinstance(bag, RawRows):
@@ -218,7 +224,7 @@ def read_streams(
 
 @dataclass(frozen=True, eq=False)
 class _Bag:
-    """Joint states and points of a bag."""
+    """Joint states and measured points of a bag, as recorded, by topic."""
 
     joint_topic: str
     joints: _Topic
@@ -237,10 +243,11 @@ class _Bag:
         length: str,
         links: Container[str],
     ) -> _Bag | RawRows:
-        """Read a bag; return rows if it holds measurements of robot_calibration.
+        """Read a bag; of a bag of robot_calibration return its rows instead.
 
-        Raises InputError for a damaged bag, without joint states of this arm or points, for
-        several topics of joint states or of poses, and for numbers beyond any arm or sensor.
+        Arguments as of `read_bag`. Raises InputError for a damaged bag, without joint states
+        of this arm or without points, for several topics of joint states or of poses, and for
+        numbers beyond any arm or sensor.
         """
         joints: dict[str, _Topic] = defaultdict(_Topic)
         found: dict[str, dict[str, _Topic]] = {kind: defaultdict(_Topic) for kind in _KINDS}
@@ -302,9 +309,10 @@ class _Bag:
 def _require_sensible(
     path: Path, joints: _Topic, points: Mapping[str, _Topic], scale: float
 ) -> None:
-    """Raise InputError for joint angles above 1e4 rad, or points above 200 m in any axis.
+    """Raise InputError for joint angles above 1e4 rad, or points above 200 m along any axis.
 
-    NaN, for a point that was not seen, is allowed. `scale`: unit of the points, m.
+    NaN, for a point that was not seen, is allowed. `scale`: unit of the points, m; `path`: for
+    the message.
     """
     angles = np.array(joints.values, dtype=float)
     if np.any(np.abs(angles) > LARGEST_RAD):
@@ -329,7 +337,8 @@ def _stamp(header: Any, log_s: float) -> float:
 def _messages(path: Path, seen: dict[str, str]) -> Iterator[tuple[str, str, Any, float]]:
     """Yield topic, type, message and time of recording, s, of joint states and points.
 
-    Puts topic -> type of all topics into `seen`. Raises InputError for a damaged bag.
+    Messages of other types are skipped; topic -> type of all topics is put into `seen`, in
+    place. Raises InputError for a damaged bag.
     """
     # Imported here: it takes a quarter of a second, which tables need not wait for.
     from rosbags.highlevel import AnyReader
@@ -370,9 +379,11 @@ def _topics(seen: dict[str, str]) -> str:
 def _joint_topic(
     path: Path, joints: dict[str, _Topic], seen: dict[str, str], chain: SerialChain
 ) -> str:
-    """The only topic with the robot's joints, or the only one that ends in ``joint_states``.
+    """Name of the one topic with all joints of the robot.
 
-    Raises InputError for none or several.
+    If several have them, the only one that ends in ``joint_states``. Raises InputError for
+    none, or if more than one is left. `joints`: topics with all joints; `seen`: topic -> type,
+    for the message.
     """
     named = [topic for topic in joints if topic.endswith('joint_states')] or list(joints)
     if len(named) == 1:
@@ -388,7 +399,7 @@ def _joint_topic(
 
 
 class _Rows:
-    """Rows of the standstills in a bag; `joints` is the stream of `joint_topic`, rad."""
+    """Rows of a bag, collected by `add`: one for each standstill of the joints and topic."""
 
     def __init__(
         self,
@@ -406,11 +417,12 @@ class _Rows:
         self._matched: list[str] = []
 
     def add(self, topic: str, stream: Stream) -> None:
-        """Add the mean point of each standstill of the joints in the stream of one topic.
+        """Add the mean point of one topic at each standstill of the joints.
 
-        The first 0.5 s of a standstill are not used. One at which the marker was not still
-        (`standstills.reading_of`) is counted and left out, as is one without points. Raises
-        InputError if the clocks' offset is not found.
+        `stream`: points, m, or poses (n, 7). The first 0.5 s of a standstill are not used. One
+        without points is left out; so is one at which the marker was not still
+        (`standstills.reading_of`), and it is counted. Raises InputError if the offset between
+        the clocks is to be found and is not.
         """
         still = self._still
         if not len(still) or not len(stream.stamps):
@@ -442,8 +454,8 @@ class _Rows:
     def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
         """All rows, sorted by standstill and topic. Raises InputError if there are none.
 
-        `topics`: those of the points; `length`: their unit; `seen`: topic -> type of the other
-        topics.
+        `topics`: those with the points; `length`: name of the points' unit in the bag; `seen`:
+        topic -> type of the topics that are not used.
         """
         path, chain, joint_topic = self._path, self._chain, self._joint_topic
         if not self._rows:

@@ -24,11 +24,13 @@ Rows = list[tuple[str, ...]]
 def wide(
     names: Sequence[str], rows: Rows, lines: Sequence[int], is_number: Callable[[str], bool]
 ) -> tuple[list[str], Rows, list[int]] | None:
-    """Names, rows and lines of a table with a row for each point; None for other tables.
+    """Column names, rows and lines of a table with one row a point; None for other tables.
 
-    Of a table of at least 9 rows, over half of them of X, Y or Z: each point has them one below
-    the other in this order. The name of the point comes first; a column of numbers becomes three,
-    ``name X`` and so on. `lines`: line of each row in the file; the result has those of X.
+    For a report with a row for each of X, Y and Z: at least 9 rows, over half of them of an
+    axis, the three of a point one below the other in this order. The name of the point comes
+    first; a column of numbers becomes three, ``name X`` and so on. `lines`: line of each row
+    in the file; the result has that of each point's X; `is_number`: whether a cell can be one
+    of a column of numbers.
 
     Raises
     ------

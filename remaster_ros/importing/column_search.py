@@ -95,14 +95,16 @@ def find_columns(
     joint_names
         Joints of the robot; a header that contains one of them is that joint's column.
     chosen
-        Columns that the user chose.
+        Columns that the user chose; those of a kind are ignored if the table lacks one of
+        them.
     sliding
         Indices of prismatic joints, whose columns hold lengths.
 
     Raises
     ------
     InputError
-        Several columns could have one meaning, or a chosen column is absent; with the remedy.
+        Several columns could have one meaning, one is chosen twice or has a unit that is not
+        converted, or there is no header and the columns are unclear; with the remedy.
     """
     found = Columns()
     headers = [Header.of(name) for name in table.names]
@@ -141,10 +143,11 @@ def find_columns(
 def _chosen_columns(
     table: TextTable, names: Sequence[str], option: str, found: Columns
 ) -> tuple[int, ...]:
-    """Indices of the columns that the user chose; () if this table does not have all of them.
+    """Indices of the columns in `names`, in that order; () if this table lacks one of them.
 
-    `names`: headers, with or without unit, case ignored, or numbers from 1. Notes the columns as
-    ``told`` in ``found.origin``. Raises InputError if one is named twice.
+    `names`: headers that the user gave, with or without unit, case ignored, or numbers from 1;
+    `option`: for the message. Notes the columns as ``told`` in ``found.origin``. Raises
+    InputError if a column is named twice.
     """
     columns = []
     index = {name.casefold(): i for i, name in enumerate(table.names)}
@@ -173,11 +176,12 @@ def _joint_columns(
     taken: set[int],
     found: Columns,
 ) -> tuple[int, ...]:
-    """Columns of the joints, base to tip; () if none are found.
+    """Columns of the joint angles, base to tip; () if none are found.
 
-    Columns of the previous joints go into `found.from_joints`, of torques into `found.efforts`;
-    all are added to `taken` and `found`, in place. Reported angles are preferred to others, and
-    sets of as many columns as the robot has joints. Raises InputError if several sets are left.
+    Columns of the angles from which the arm came go into `found.from_joints`, of torques into
+    `found.efforts`. All three are added to `taken` and to `found.origin`, in place. Reported
+    angles are preferred to commanded ones, and sets of as many columns as the robot has
+    joints. Raises InputError if several sets are left. `sliding`: indices of prismatic joints.
     """
     complete: dict[tuple[str, ...], tuple[int, ...]] = {}
     schemes = [tuple(tuple(Header.of(name).words) for name in joint_names)]
@@ -237,7 +241,7 @@ def _single_set(
 ) -> tuple[int, ...]:
     """The only set of columns; () if there is none. Raises InputError if there are several.
 
-    `what`, `remedy`: what the sets could be, and what to do, for the message.
+    `what`, `remedy`: what the columns could be, and what to do, for the message.
     """
     if len(sets) > 1:
         listed = '; '.join(', '.join(table.names[i] for i in columns) for columns in sets[:4])
@@ -248,10 +252,11 @@ def _single_set(
 def _joint_number(
     words: tuple[str, ...], named: Sequence[tuple[str, ...]]
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Number of the joint, from 1, that a header names, and the other words.
+    """Number of the joint that a header names, and the header's words with the joint replaced.
 
-    The name is replaced by '=', a mere number by '*'. None and () if it names no joint. `named`:
-    words of each joint's name.
+    From 1 if a name of the robot is found, which becomes '=' (and its number beside it '#');
+    else the only number among several words, as written, which becomes '*'. None and () if
+    neither is there. `words`: of the header; `named`: words of each joint's name.
     """
     for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
@@ -273,10 +278,11 @@ def _joint_number(
 def _chosen_points(
     table: TextTable, headers: Sequence[Header], names: Sequence[str], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Columns by marker of --points, by marker names or by three columns each.
+    """Columns X, Y, Z by marker, as the user named them with --points.
 
-    Notes the origin of the columns in `found`; {} if this table does not have all of them. Raises
-    InputError if their number is no multiple of three.
+    `names`: markers, or columns, three for each marker. Notes the columns as ``told`` in
+    ``found.origin``; {} if this table does not have all of them. Raises InputError if the
+    number of columns is no multiple of three.
     """
     groups = {name: table.groups[name] for name in table.groups} or {
         _marker_label(table, columns): columns for columns in _xyz_groups(headers, set()).values()
@@ -298,9 +304,10 @@ def _chosen_points(
 def _columns_by_marker(
     table: TextTable, sets: Sequence[tuple[int, ...]]
 ) -> dict[str, tuple[int, ...]]:
-    """Columns X, Y, Z by marker; the name of a single marker is ''.
+    """Columns X, Y, Z by marker name, from triples of columns; {} if there are none.
 
-    Markers are named by their headers, or marker_1, marker_2, … if two of these are equal.
+    The name of a single marker is ''. Several are named by their headers, or marker_1,
+    marker_2, … if two of these are equal.
     """
     if len(sets) < 2:
         return dict.fromkeys([''] * len(sets), sets[0]) if sets else {}
@@ -324,10 +331,11 @@ def _marker_label(table: TextTable, columns: Sequence[int]) -> str:
 def _xyz_groups(
     headers: Sequence[Header], taken: set[int], fewest: int = 3
 ) -> dict[tuple[str, ...], tuple[int, ...]]:
-    """Columns X, Y and Z, in this order, by the words around the axis, '*' for the axis.
+    """Groups of columns X, Y and Z, in this order, by the words of their headers.
 
-    Groups with fewer than `fewest` of the three are left out, as are columns in `taken` and those
-    with a unit that is no length.
+    The key has '*' in place of the axis: ('tcp', '*') for ``tcp_x``. Groups with fewer than
+    `fewest` of the three axes are left out, as are columns in `taken` and those with a unit
+    that is no length.
     """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
     for i, header in enumerate(headers):
@@ -348,11 +356,12 @@ def _xyz_groups(
 def _point_columns(
     table: TextTable, headers: Sequence[Header], taken: set[int], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Columns X, Y, Z by marker; columns of standard deviations go into `found.stds`.
+    """Columns X, Y, Z of the measured points by marker; {} if there are none.
 
-    {} if there are none. Nominal positions, deviations and the robot's own tool are not taken if
-    there are others. Adds the columns to `taken` and `found`, in place. Raises InputError if
-    several could be the measured point, or an axis of it is missing.
+    Columns of standard deviations go into `found.stds`. Nominal positions and deviations are
+    never taken, the robot's own tool only if there is nothing else. Adds the columns to
+    `taken` and to `found.origin`, in place. Raises InputError if several could be the measured
+    point, or an axis of it is missing.
     """
     if table.groups:
         chosen = {name: table.groups[name] for name in table.points or table.groups}
@@ -395,7 +404,10 @@ def _point_columns(
 
 
 def _lettered_stems(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
-    """Word groups that differ only in one letter, which runs A, B and so on without a gap."""
+    """Those groups of header words that differ in one letter only: A, B and so on without a gap.
+
+    `stems`: words of each group of columns, lower case.
+    """
     alike: dict[tuple[str, ...], dict[str, tuple[str, ...]]] = defaultdict(dict)
     for stem in stems:
         for i, word in enumerate(stem):
@@ -410,11 +422,11 @@ def _lettered_stems(stems: Iterable[tuple[str, ...]]) -> set[tuple[str, ...]]:
 
 
 def _columns_by_place(table: TextTable, found: Columns, joints: int) -> Columns:
-    """Complete `found` (changed in place) by the place of columns without a header.
+    """Complete `found`, in place, by the place of columns in a table without a header; return it.
 
-    A name, joints, then X, Y, Z; or only the joints, or only X, Y, Z; row numbers may come first.
-    `joints`: number of the robot's joints. Raises InputError if nothing is found and the number of
-    numeric columns fits none of these.
+    A name, joints, then X, Y, Z; or only the joints, or only X, Y, Z; row numbers may come
+    first. `joints`: number of the robot's joints. Raises InputError if nothing is found and
+    the number of numeric columns fits none of these.
     """
     if table.groups and not found.points:
         found.points, found.orientations = {**table.groups}, {**table.turns}

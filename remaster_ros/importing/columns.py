@@ -59,6 +59,6 @@ class ColumnChoice:
 
 
 def claim(found: Columns, columns: Sequence[int], taken: set[int]) -> None:
-    """Mark columns as used, with their meaning known from the header, in `taken` and `found`."""
+    """Add columns to `taken`, and note in `found.origin` that their header gave the meaning."""
     taken.update(columns)
     found.origin.update(dict.fromkeys(columns, 'header'))

@@ -64,7 +64,11 @@ class Header:
         return cls(tuple(word.lower() for word in words), unit)
 
     def kind(self) -> str:
-        """Kind of a column other than joints and points, a key of `_WORDS`; '' if it has none."""
+        """Kind of a column other than joints and points; '' if it has none.
+
+        'name', 'time', 'date', 'clock' (time of day), 'pose', 'configuration', 'split',
+        'sensor', 'marker', 'temperature' or 'samples'.
+        """
         words = [word for word in self.words if word not in ('s', 'c', 'ns', 'ms', 'air', 'nsec')]
         joined = ''.join(words)
         if joined in _KINDS:
@@ -89,7 +93,11 @@ def _first_kind(words: Sequence[str]) -> str:
 
 
 def with_axis(words: Sequence[str]) -> tuple[str, ...]:
-    """Words with `px`, `posx`, `sy` or `dz` split into prefix and axis, and easting as `x`."""
+    """Words of a header with each axis as a word of its own: 'p', 'x' for `px`, 'x' for `easting`.
+
+    `px`, `posx`, `sx`, `dx`, `rx`, `tx` and `vx`, and the same of y and z, are split. Words
+    such as `grid` that only surveyed heights have are left out.
+    """
     words = [_AXIS_WORDS.get(word, word) for word in words if word not in _SURVEYED]
     split = (
         (word[:-1], word[-1]) if re.fullmatch(r'(?:p|pos|s|d|r|t|v)[xyz]', word) else (word,)

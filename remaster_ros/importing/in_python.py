@@ -37,7 +37,7 @@ log = logging.getLogger('remaster_ros')
 
 @dataclass(frozen=True)
 class Choices:
-    """Options given to a Python function, and the names of its arguments."""
+    """Options of an import from Python, and the argument names of the function that was called."""
 
     table: TableOptions
     corrections: SessionOptions
@@ -49,12 +49,13 @@ class Choices:
 def of_arrays(
     joints: Any, points: Any, robot: tuple[str, SerialChain], choices: Choices
 ) -> Session:
-    """Session from arrays of joints, (n, k), and points, (n, 3), row by row; see `session_from`.
+    """Session from joints, (n, k), and points, (n, 3), that belong together row by row.
 
-    In rad and m unless the options state units. Two data frames are joined as tables. Rows with
-    NaN are left out, with a warning in the log. Raises InputError for other shapes or numbers of
-    rows, infinite values, or joints beyond their limits, and InsufficientDataError if they do not
-    fit the robot.
+    Arrays, or data frames or dicts with named columns; in rad and m unless the options state
+    units. Two data frames are joined as tables. Rows with NaN are left out, with a warning in
+    the log. Raises InputError for other shapes or numbers of rows, infinite values, or joints
+    beyond their limits, and InsufficientDataError if the rows do not fit the robot. `robot`:
+    URDF text and arm.
     """
     urdf, chain = robot
     if is_frame(joints) and is_frame(points):
@@ -90,7 +91,11 @@ def of_arrays(
 
 
 def of_files(files: Sequence[Any], robot: tuple[str, SerialChain], choices: Choices) -> Session:
-    """Session from files or data frames; see `import_table`. Raises as `of_tables`."""
+    """Session from one or two files or data frames; `robot`: URDF text and arm.
+
+    Raises as `of_tables`, and InputError for data frames with an index label that is there
+    twice.
+    """
     frames = [file for file in files if is_frame(file)]
     names = ['frame'] if len(frames) == 1 else [f'frame {i + 1}' for i in range(len(frames))]
     with _with_argument_names(choices.arguments):
@@ -105,8 +110,9 @@ def of_tables(
 ) -> Session:
     """Session from one table, or from a table of joints and one of points that are joined.
 
-    Raises InputError for a table that cannot be read or understood or joints beyond their limits,
-    and InsufficientDataError if it does not fit the robot; both name arguments of the function.
+    `robot`: URDF text and arm. Raises InputError for a table that cannot be read or understood
+    or joints beyond their limits, and InsufficientDataError if the table does not fit the
+    robot; messages name arguments of the Python function, not options of the command.
     """
     urdf, chain = robot
     with _with_argument_names(choices.arguments):
@@ -119,9 +125,10 @@ def of_tables(
 
 @contextlib.contextmanager
 def _with_argument_names(arguments: Collection[str]) -> Iterator[None]:
-    """Replace options of the command in errors by the arguments of the function.
+    """Context in which errors name a function's arguments in place of the command's options.
 
-    Concerns InputError and InsufficientDataError; their type stays.
+    An InputError or InsufficientDataError of the body is raised again with the new text, as
+    the same type; other errors pass. `arguments`: names of the function's arguments.
     """
     try:
         yield
@@ -136,10 +143,10 @@ def _with_argument_names(arguments: Collection[str]) -> Iterator[None]:
 def _checked_session(
     rows: RawRows, urdf: str, chain: SerialChain, choices: Choices, notes: str
 ) -> Session:
-    """Session of rows that fit the robot; warnings are logged.
+    """Session of the rows, once these are found to fit the robot; warnings are logged.
 
-    Whole turns are taken off. Raises InsufficientDataError, with a remedy, if the rows do not fit,
-    and InputError if joints are beyond their limits.
+    Whole turns of joints are taken off. Raises InsufficientDataError, with a remedy, if the
+    rows do not fit, and InputError if joints are beyond their limits. `notes`: of the session.
     """
     with _with_argument_names(choices.arguments):
         options, _ = with_controller_coupling(rows, chain, choices.corrections)

@@ -36,7 +36,7 @@ ALIKE = 1.03
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Splines of k joints in stretches of time, in order."""
+    """Joint positions as functions of time: smoothing splines over stretches without a gap."""
 
     begin: FloatArray  # Of each stretch, s, (stretches,)
     end: FloatArray
@@ -46,11 +46,11 @@ class JointMotion:
 
     @classmethod
     def of(cls, joints: Stream, where: str) -> JointMotion:
-        """Splines of joint states, rad; ``where``: for messages.
+        """Smoothing splines of the joint positions in a stream of joint states, rad.
 
-        A gap of over 0.1 s and over five usual steps ends a stretch; stretches of under 0.5 s are
-        left out. Raises InputError if the median rate is below 40 Hz (`LEAST_RATE_HZ`), or no
-        stretch is long enough.
+        A gap of over 0.1 s and over five usual steps ends a stretch; stretches of under 0.5 s
+        are left out. Raises InputError if the median rate is below 40 Hz (`LEAST_RATE_HZ`), or
+        no stretch is long enough. ``where``: name of the recording, for messages.
         """
         stamps, values = _increasing(joints)
         if len(stamps) < 2:
@@ -90,15 +90,19 @@ class JointMotion:
         )
 
     def stretch(self, times: FloatArray) -> FloatArray:
-        """Index of the stretch of each time, s, (n,), from 0; -1 outside all."""
+        """Index, from 0, of the stretch that contains each time, (n,); -1 for times outside all.
+
+        ``times``: s, (n,).
+        """
         index = np.searchsorted(self.begin, times, side='right') - 1
         inside = (index >= 0) & (times <= self.end[np.maximum(index, 0)])
         return np.where(inside, index, -1)
 
     def at(self, times: FloatArray, derivative: int = 0) -> FloatArray:
-        """Joint positions, rad, at times, s, (n, k); NaN outside all stretches.
+        """Joint positions, rad, at n times, (n, k); NaN at times outside all stretches.
 
-        `derivative` 1 and 2: velocities and accelerations, rad/s and rad/s².
+        ``times``: s, (n,); ``derivative``: 1 or 2 for velocities, rad/s, or accelerations,
+        rad/s².
         """
         stretch = self.stretch(times)
         result = np.full((len(times), len(self.noise)), np.nan)
@@ -112,17 +116,21 @@ class JointMotion:
 
 
 def _increasing(joints: Stream) -> tuple[FloatArray, FloatArray]:
-    """Stamps and values of reports with increasing stamps: of those within 1 µs the first."""
+    """Stamps, s, (m,), and values, (m, k), of reports with increasing stamps.
+
+    Reports within 1 µs of the one before are left out.
+    """
     kept: BoolArray = np.diff(joints.stamps, prepend=-np.inf) > 1e-6
     return joints.stamps[kept], joints.values[kept]
 
 
 def _smoothing(stamps: FloatArray, values: FloatArray, step: float) -> tuple[float, float]:
-    """Smoothing time of a joint, s, and the standard deviation of its reports, rad.
+    """Smoothing time of a joint's spline, s, and the standard deviation of its reports, rad.
 
-    The longest smoothing time with the least score of generalised cross-validation (Craven & Wahba
-    1979, Numer. Math. 31), within a tolerance; the residuals are then noise. By the part of the
-    record in which the joint moves most.
+    The longest time whose score of generalised cross-validation (Craven & Wahba 1979, Numer.
+    Math. 31) is within 3 % of the least; the residuals are then noise. By the 3,000 reports at
+    most in which the joint moves most. ``values``: of one joint, rad, (n,); ``step``: median
+    step of ``stamps``, s.
     """
     moved = np.abs(np.diff(values, prepend=values[0]))
     middle = int(np.argmax(np.convolve(moved, np.ones(min(MOST_TRIED, len(moved))), 'same')))

@@ -105,7 +105,7 @@ class MarkerStream:
 
 @dataclass(frozen=True)
 class MovingOptions:
-    """The user's statements on the session."""
+    """User's options for a session of a moving arm: marker positions, clock offset, hold-out."""
 
     # Marker -> nominal position in the tool frame, m; others are unknown
     places: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class MovingOptions:
 
 
 class _Guess(NamedTuple):
-    """Robust fit, for the predicted positions of the markers."""
+    """Result of a robust fit, from which the markers' measured positions are predicted."""
 
     joint_offsets: FloatArray  # rad, (k,)
     markers: FloatArray  # In T, m, (markers, 3)
@@ -127,7 +127,7 @@ class _Guess(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """Frames of one sensor: f stamps, m markers."""
+    """Camera frames of one sensor: positions of m markers at f stamps."""
 
     stamps: FloatArray  # s, rising, (f,)
     positions: FloatArray  # m, NaN of a marker that was not seen, (f, m, 3)
@@ -136,7 +136,11 @@ class _Frames:
 
     @classmethod
     def of(cls, streams: Sequence[MarkerStream], markers: Sequence[str]) -> _Frames:
-        """Frames of a sensor from its markers' streams, joined by stamps."""
+        """Frames of a sensor from its markers' streams: positions with equal stamps are one frame.
+
+        ``streams``: of this sensor; ``markers``: names of all markers, whose indices the
+        frames have.
+        """
         stamps = np.unique(np.concatenate([stream.stream.stamps for stream in streams]))
         positions = np.full((len(stamps), len(streams), 3), np.nan)
         for index, stream in enumerate(streams):
@@ -146,12 +150,12 @@ class _Frames:
         )
 
     def at_constant_rate(self) -> _Frames | None:
-        """Frames with stamps at a constant rate; None if they do not come at one.
+        """Same frames with stamps at a constant rate; None if the camera has no such rate.
 
-        A frame's number counts the frames before it and those lost: by so much their delay has
-        risen for good. Frames, or all of a while, may be late. They come at a constant rate if
-        nine tenths of the numbers are sure, and as many of these frames are within half a period
-        of it; the frames without a sure number are left out.
+        Each frame gets a number, which counts the frames before it and those that were lost;
+        late frames (delayed on their way, for any time) keep theirs. None unless nine tenths
+        of the numbers are certain, and nine tenths of these frames are within half a period of
+        the constant rate. Frames without a certain number are left out.
         """
         stamps = self.stamps
         gaps = np.diff(stamps)
@@ -191,9 +195,10 @@ class _Frames:
 
 
 def _rising(values: FloatArray) -> FloatArray:
-    """Nearest sequence, by least squares, that never falls, (n,): pool adjacent violators.
+    """Least-squares fit to values (n,) by a sequence that never falls, (n,).
 
-    Ayer et al. (1955), doi:10.1214/aoms/1177728423; SciPy has it from 1.12 on, Ubuntu 24.04 1.11.
+    Pool adjacent violators: Ayer et al. (1955), doi:10.1214/aoms/1177728423; SciPy has it from
+    1.12 on, Ubuntu 24.04 1.11.
     """
     pools: list[tuple[float, int]] = []
     for value in values.tolist():
@@ -219,7 +224,7 @@ def _less_mean(values: FloatArray, run: IntArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Rows of one sensor, a block of time each: b blocks, m markers."""
+    """Rows of one sensor: b blocks of 0.1 s with joint motion and mean positions of m markers."""
 
     number: IntArray  # Of the block in the whole record, rising, (b,)
     times: FloatArray  # By the joints' clock, s, (b,)
@@ -232,7 +237,7 @@ class _Block:
 
 
 class _Recording:
-    """Joint motion and frames, from which rows are made for any offset of the clocks."""
+    """Joint motion and camera frames; makes rows of them for any offset between the clocks."""
 
     def __init__(
         self,
@@ -249,12 +254,13 @@ class _Recording:
         self.dropped = 0
 
     def blocks(self, sensor: int, clock_s: float, guess: _Guess | None) -> _Block:
-        """Rows of a sensor, of `BLOCK_S` each, with its stamps shifted by an offset, s.
+        """Rows of a sensor, one for each 0.1 s (`BLOCK_S`), with an offset added to its stamps.
 
-        ``sensor``: its index; ``guess``: None to take the plain means of the frames. Blocks with
-        under half of the usual frames, or in which all joints are slower than `STILL_RAD_S`, are
-        left out. With a guess, frames far from their row (`GROSS` times the median) are counted in
-        ``dropped``.
+        ``sensor``: its index; ``clock_s``: the offset, s; ``guess``: fit whose prediction is
+        taken off before the mean, None for plain means of the frames. Left out are blocks with
+        under half of the usual frames, or in which all joints are slower than `STILL_RAD_S`;
+        with a guess also frames far from their row (`GROSS` times the median distance), which
+        `dropped` counts.
         """
         frames, motion = self.frames[list(self.frames)[sensor]], self.motion
         times = frames.stamps + clock_s
@@ -303,10 +309,11 @@ class _Recording:
         )
 
     def fitted(self, clocks_s: FloatArray, found: bool) -> tuple[FloatArray, _Guess, float]:
-        """Clock offsets, s, (sensors,), robust fit and the median error that it leaves, m.
+        """Clock offset of each sensor, s, (sensors,), robust fit, and its median error, m.
 
-        ``clocks_s``: offsets to begin with; ``found``: whether they are to be found, in up to 12
-        steps until all are below 20 µs. Raises InputError as `session`.
+        ``clocks_s``: offsets to begin with; ``found``: whether to improve them, in up to 12
+        steps until all steps are below 20 µs, else they are returned as given. Raises
+        InputError as `session`.
         """
         guess: _Guess | None = None
         error_m = np.inf
@@ -320,7 +327,11 @@ class _Recording:
         return clocks_s, guess, error_m
 
     def _seen(self, q: FloatArray, markers: IntArray, sensor: int, guess: _Guess) -> FloatArray:
-        """Predicted positions of markers in a sensor's frame, m, (n, m, 3)."""
+        """Predicted positions of markers in a sensor's frame, m, (n, m, 3).
+
+        ``q``: rad, (n, k); ``markers``: indices, (m,); ``sensor``: index; ``guess``: fit to
+        predict by.
+        """
         points = self.chain.positions(
             q[:, None, :], guess.markers[markers], guess.joint_offsets[None, None, :]
         )
@@ -329,9 +340,10 @@ class _Recording:
     def session(
         self, clocks_s: FloatArray, guess: _Guess | None, rng: np.random.Generator | None = None
     ) -> Session:
-        """Session with the sensors' stamps shifted by offsets, s, (sensors,).
+        """Session of the rows of all sensors, with offsets added to the sensors' stamps.
 
-        ``rng``: draws the held-out segments; None for none. ``guess``: as in `blocks`. Raises
+        ``clocks_s``: the offsets, s, (sensors,); ``guess``: as in `blocks`; ``rng``: draws the
+        held-out segments, None to hold none out. `dropped` counts the frames left out. Raises
         InputError if a sensor saw the arm move in fewer than 60 rows.
         """
         self.dropped = 0
@@ -377,9 +389,10 @@ class _Recording:
         return self._session(joined, dict(zip(names, clocks_s.tolist(), strict=True)))
 
     def _held_out(self, pose: IntArray, rng: np.random.Generator) -> BoolArray:
-        """Whether each row is held out: a random segment of each of consecutive runs.
+        """Mask of the held-out rows, (n,): one random segment of each run of consecutive segments.
 
-        Runs are about as many as `hold_out` times the segments; none is held out if that is 0.
+        ``pose``: index of the segment of each row, (n,). Runs are about as many as the
+        `hold_out` of the options times the segments; nothing is held out if that is 0.
         """
         segments = np.unique(pose)
         if not self.options.hold_out:
@@ -388,9 +401,10 @@ class _Recording:
         return np.isin(pose, [rng.choice(run) for run in runs])
 
     def _session(self, measurements: Measurements, clock_offset_s: dict[str, float]) -> Session:
-        """Session of the rows; markers without a stated position are at the tip.
+        """Session of rows; markers without a stated position are put at the tip.
 
-        `marker_std_m` is then `UNKNOWN_MARKER_STD_M`, unless it is stated.
+        If there is such a marker, `marker_std_m` is `UNKNOWN_MARKER_STD_M`, else 0.5 mm,
+        unless the user stated it. ``clock_offset_s``: by sensor.
         """
         options = self.options
         known = all(name in options.places for name in self.markers)
@@ -426,7 +440,7 @@ def moving_session(
     options: MovingOptions,
     rng: np.random.Generator,
 ) -> tuple[Session, list[str]]:
-    """Session of each continuous motion in a recording, and sentences on how it was made.
+    """Session of the continuous motions in a recording, and sentences on how it was made.
 
     Parameters
     ----------
@@ -435,7 +449,7 @@ def moving_session(
     joints
         Joint positions, rad, (n, k), by their stamps.
     streams
-        Measurements of the sensors, at least one.
+        Measurements of the sensors, at least one; sensors of under 10 frames/s are left out.
     chain, urdf
         Nominal arm.
     options
@@ -451,7 +465,8 @@ def moving_session(
     Raises
     ------
     InputError
-        If joint states are too rare, a sensor saw hardly any motion, or a joint of the arm slides.
+        If joint states are too rare, no sensor is fast enough, a sensor saw hardly any motion,
+        or a joint of the arm slides.
     """
     for joint in np.flatnonzero(chain.slides)[:1]:
         raise InputError(
@@ -519,10 +534,10 @@ def moving_session(
 
 
 def with_proof(session: Session, joints: Stream, name: str, standing: Session) -> Session:
-    """Return a moving session with the held-out standstills of another as held-out rows.
+    """Return a moving session with the held-out rows of a standstill session added to its rows.
 
-    Their velocities are 0; ``from_q`` is where each joint turned last before it came to rest
-    (`effective_turns`), by which the friction is known that holds it.
+    The added rows are held out and have velocity 0; their ``from_q`` is the joint position
+    from which the friction at rest follows (`effective_turns`).
 
     Parameters
     ----------
@@ -531,8 +546,8 @@ def with_proof(session: Session, joints: Stream, name: str, standing: Session) -
     joints
         Joint positions, rad, (n, k), by the stamps of both sessions.
     name, standing
-        Session whose poses were measured at standstill by the same sensors and markers, none of
-        which was moved in between; its name, for messages.
+        Session whose poses were measured at standstill by the same sensors and markers, none
+        of which was moved in between; its name, for messages.
 
     Raises
     ------
@@ -577,11 +592,12 @@ def with_proof(session: Session, joints: Stream, name: str, standing: Session) -
 
 
 def effective_turns(motion: JointMotion, stamps: FloatArray) -> FloatArray:
-    """Return where joints at rest at some times would have turned last, rad, (n, k).
+    """Return the last turning point of each joint that explains its friction at rest, rad, (n, k).
 
-    Such that the one turn leaves the friction that the arm's way has left, Dahl's model with the
-    travel `FRICTION_TRAVEL_RAD`: a servo overshoots and goes back by about that. NaN outside the
-    record. ``stamps``: s, (n,).
+    A move from there straight to the joint's present position would leave the same friction as
+    the real way before each of the times, in Dahl's model with the travel
+    `FRICTION_TRAVEL_RAD`: a servo overshoots and goes back by about that. NaN outside the
+    record. ``stamps``: the times, s, (n,).
     """
     turns = np.full((len(stamps), len(motion.noise)), np.nan)
     for row, stamp in enumerate(stamps):
@@ -602,7 +618,11 @@ def effective_turns(motion: JointMotion, stamps: FloatArray) -> FloatArray:
 
 
 def _restamped(name: str, frames: _Frames, steady: _Frames) -> str:
-    """Sentence on stamps that were replaced; '' if they were not."""
+    """Sentence on a sensor's stamps that were replaced by a constant rate; '' if they were not.
+
+    ``name``: of the sensor; ``steady``: frames with the new stamps, the same object if not
+    replaced.
+    """
     if steady is frames:
         return ''
     rate_hz = 1.0 / float(np.median(np.diff(steady.stamps)))
@@ -616,7 +636,7 @@ def _restamped(name: str, frames: _Frames, steady: _Frames) -> str:
 
 
 def _rate_hz(stream: Stream) -> float:
-    """Usual number of values in a second; 0 for fewer than two values."""
+    """Rate by the median step between different stamps, Hz; 0 if there is no such step."""
     steps = np.diff(stream.stamps)
     steps = steps[steps > 0.0]
     return float(1.0 / np.median(steps)) if len(steps) else 0.0
@@ -628,9 +648,9 @@ def _late(seconds: float) -> str:
 
 
 def _segments(number: IntArray) -> IntArray:
-    """Segment of each block, (b,), from 0, by the rising numbers of the blocks (b,).
+    """Index, from 0, of the segment of each time block, (b,): about five successive blocks.
 
-    A gap in the numbers ends a segment; others have about five blocks.
+    ``number``: of each block in the record, rising, (b,). A gap in the numbers ends a segment.
     """
     runs = np.split(np.arange(len(number)), np.flatnonzero(np.diff(number) > 1) + 1)
     segment, count = np.zeros(len(number), np.int64), 0
@@ -644,9 +664,11 @@ def _segments(number: IntArray) -> IntArray:
 def _means(
     values: FloatArray, block: IntArray, blocks: int
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Mean and standard deviation of each block, (b, m, 3), and number of samples, (b, m).
+    """Mean and standard deviation in each block, (b, m, 3), and number of samples, (b, m).
 
-    ``values``: (f, m, 3), NaN for a marker that was not visible; ``block``: of each frame, (f,).
+    ``values``: (f, m, 3), NaN for a marker that was not visible; ``block``: index of the block
+    of each frame, rising, (f,); ``blocks``: b. The mean is NaN without a sample, the deviation
+    with up to one.
     """
     seen = np.isfinite(values[..., 0])
     first = np.searchsorted(block, np.arange(blocks))
@@ -663,7 +685,7 @@ def _means(
 
 
 def _joined(parts: Sequence[Measurements]) -> Measurements:
-    """Rows of all sensors in the order of time, sensor and marker, numbered from 0."""
+    """Rows of all parts in the order of time, sensor and marker, with new numbers from 0."""
     columns = {
         name: None
         if getattr(parts[0], name) is None
@@ -674,7 +696,7 @@ def _joined(parts: Sequence[Measurements]) -> Measurements:
 
 
 def _in_order(measurements: Measurements) -> Measurements:
-    """Rows in the order of time, sensor and marker, numbered from 0."""
+    """Rows in the order of time, sensor and marker, with new observation numbers from 0."""
     order = np.lexsort((measurements.marker, measurements.sensor, measurements.stamp_s))
     return replace(measurements.select(order), observation=np.arange(len(measurements)))
 
@@ -686,10 +708,10 @@ def _clock_by_speeds(
     options: MovingOptions,
     markers: Sequence[str],
 ) -> float:
-    """Offset of the clocks with the largest correlation of speeds of marker and tool, s.
+    """Offset to be added to a sensor's stamps, s, by the speeds of its first marker and the tool.
 
-    To be added to the sensor's stamps; sought within 3 s in steps of 5 ms, by the first marker. 0
-    if no correlation is above 0.5, or the marker is in fewer than 60 frames.
+    That of the largest correlation, within 3 s in steps of 5 ms. 0 if no correlation is above
+    0.5, or the marker is in fewer than 60 frames. ``markers``: names of all markers, by index.
     """
     grid = np.arange(motion.begin[0], motion.end[-1], SPEED_STEP_S)
     name = markers[frames.markers[0]]
@@ -725,10 +747,9 @@ def _clock_by_speeds(
 
 
 def _robust_fit(session: Session) -> tuple[_Guess, FloatArray, float]:
-    """Robust fit of a session, the remaining offset of each sensor's clock, s, and the error.
+    """Robust fit of a session, remaining offset of each sensor's clock, s, and median error, m.
 
-    The offset, (sensors,), is still to be added to the stamps; the error is the median distance,
-    m.
+    The offsets, (sensors,), are to be added to the stamps. At most 1,500 rows to fit are used.
     """
     problem = Problem.of(session)
     measurements, rows = problem.measurements, problem.fitted

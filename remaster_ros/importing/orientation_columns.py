@@ -29,8 +29,9 @@ _AS_AXIS = {'i': 'x', 'j': 'y', 'k': 'z', 'r': 'w'}
 def find_orientation(headers: Sequence[Header], taken: set[int], found: Columns) -> None:
     """Find the columns of an orientation measured with the points of a single marker.
 
-    A quaternion with letters goes into `found.orientations`, three angles or a quaternion without
-    letters into `found.ambiguous_orientation`. Nothing is done with several markers, or if several
+    A quaternion whose headers have x, y, z, w goes into `found.orientations`; three angles, or
+    a quaternion numbered 0 to 3 or 1 to 4, into `found.ambiguous_orientation`. `found` and
+    `taken` are changed in place; nothing is done with no or several markers, or if several
     orientations are as likely.
     """
     groups: dict[tuple[str, ...], dict[str, int]] = defaultdict(dict)
@@ -62,9 +63,10 @@ def find_orientation(headers: Sequence[Header], taken: set[int], found: Columns)
 
 
 def _has_words_of_point(headers: Sequence[Header], found: Columns, columns: Sequence[int]) -> bool:
-    """Whether the header of an orientation has the same words as the header of the point.
+    """Whether the headers of an orientation and of the point have the same other words.
 
-    Words for axes, positions and turns are not compared; `columns`: those of the orientation.
+    Words for axes, positions and rotations are not compared; `columns`: those of the
+    orientation.
     """
     stems = [
         tuple(word for word in with_axis(headers[i].words) if word not in (*AXES, *_PLACES))
@@ -74,9 +76,10 @@ def _has_words_of_point(headers: Sequence[Header], found: Columns, columns: Sequ
 
 
 def _orientation_component(words: tuple[str, ...]) -> tuple[tuple[str, ...], str]:
-    """Words around an angle or quaternion component in a header, and its name.
+    """Other words of a header, and the orientation component that it names.
 
-    () and '' if the header names none.
+    The component is an angle such as 'roll', a letter, or a digit of a quaternion. () and ''
+    if the header names none.
     """
     turned = {*words} & _TURNED
     for at, word in enumerate(words):

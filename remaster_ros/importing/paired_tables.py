@@ -70,8 +70,8 @@ def raw_rows(
 ) -> RawRows:
     """Rows in SI from a table of points and a table of joints that belong together row by row.
 
-    One for each marker seen in a row. `angles`, `length`: units that the user stated, '' if none;
-    `has_times`: whether times of the tables are taken if there are no others. Raises InputError
+    One for each marker seen in a row of the table. `angles`, `length`: units that the user
+    stated, '' if none; `has_times`: whether the columns of times are used. Raises InputError
     for missing or faulty numbers, units that do not fit, or points beyond 200 m.
     """
     points, joints = pair.points, pair.joints
@@ -130,8 +130,9 @@ def raw_rows(
 def _readings(points: Table, modelled: FloatArray, stated_unit: str) -> _Readings:
     """Readings of the markers that move with the arm, one for each marker seen in a row.
 
-    `modelled`: points of the robot, m, (n, 3), for the unit if nothing states it. Raises
-    InputError for part of a point, headers with several units, or points beyond 200 m.
+    `modelled`: positions of the nominal tool, m, (n, 3), by which the unit is guessed if
+    neither the user (`stated_unit`) nor the table states it. Raises InputError for part of a
+    point, headers with several units, or points beyond 200 m.
     """
     table, columns = points
     several = len(columns.points) > 1
@@ -151,7 +152,10 @@ def _readings(points: Table, modelled: FloatArray, stated_unit: str) -> _Reading
 
 
 def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray) -> None:
-    """Raise InputError for a point of which X, Y or Z is missing, or if no point is left."""
+    """Raise InputError for a point with only some of X, Y, Z, or if several markers have no point.
+
+    `raw`: points by marker, NaN where empty, (markers, n, 3).
+    """
     for marker_columns, points in zip(columns.points.values(), raw):
         empty = np.isnan(points)
         for row in np.flatnonzero(empty.any(axis=1) & ~empty.all(axis=1))[:1]:
@@ -182,9 +186,10 @@ def _markers_on_arm(
 
 
 def _previous_joints(joints: Table, scale: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Joints from which the arm came, in SI, of a shape (n, k); NaN if the table has none.
+    """Joint positions from which the arm came, rad or m, of a shape (n, k).
 
-    `scale`: unit of each joint in SI, (k,).
+    NaN where a cell is empty, and throughout if the table does not have k such columns.
+    `scale`: unit of each joint's column in SI, (k,).
     """
     table, columns = joints
     if len(columns.from_joints) != shape[1]:
@@ -228,9 +233,10 @@ def _refuse_non_unit_quaternions(
 
 
 def _ambiguous_orientation(points: Table, row: IntArray) -> tuple[FloatArray | None, str]:
-    """Orientation without a stated convention, (m, 3) or (m, 4), in the rows used, and its unit.
+    """Orientation of unknown convention in the rows used, (m, 3) or (m, 4), and its unit.
 
-    None and '' if there are no columns of such an orientation.
+    Three angles or four numbers of a quaternion, NaN where empty; unit '' if the header has
+    none. None and '' if there are no such columns. `row`: indices of the m rows used.
     """
     table, columns = points
     if not columns.ambiguous_orientation:
@@ -240,7 +246,10 @@ def _ambiguous_orientation(points: Table, row: IntArray) -> tuple[FloatArray | N
 
 
 def _efforts(pair: PairedTables) -> FloatArray | None:
-    """Measured joint torques, N m, (n, k); None if the table has none or is of standstills."""
+    """Measured joint torques, N m, (n, k), NaN where empty; None if the table has no such columns.
+
+    None also if the rows are means over standstills (`PairedTables.stamp_s` is set).
+    """
     table, columns = pair.joints
     # Of a stream the torques are those of one moment, and no mean over a standstill.
     if columns.efforts and pair.stamp_s is None:
@@ -251,9 +260,11 @@ def _efforts(pair: PairedTables) -> FloatArray | None:
 def _stamps(
     pair: PairedTables, q: FloatArray, has_times: bool
 ) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """Times of the rows, s, (n,), and a sentence if they are not usable; None then, or without.
+    """Times of the rows, s, (n,), and a sentence (a tuple of one) if they are unusable.
 
-    Times of the points if these have any, else of the joints; neither if not `has_times`.
+    Those of `PairedTables.stamp_s`; else, if `has_times`, of the points' table or of the
+    joints' table. None if there are none, or if over half of the configurations share one
+    time; only the latter has a sentence, else ().
     """
     stamp = pair.stamp_s
     if stamp is None and has_times:
@@ -291,9 +302,10 @@ def _optional_column(points: Table, kind: str) -> FloatArray:
 
 
 def _labels(pair: PairedTables, readings: _Readings) -> dict[str, list[str]]:
-    """Texts of the readings by kind (``pose``, ``sensor``, …), of kinds with a column.
+    """Label of each reading by kind: pose, configuration, split, sensor, marker.
 
-    Those of the points' table come first; of several markers their names.
+    Only kinds that have a column, in the points' table or else in the joints'. Of several
+    markers their names are the kind 'marker'.
     """
     given: dict[str, list[str]] = {}
     for kind in _OTHERS:
@@ -313,9 +325,9 @@ def _meanings_in_tables(
     units: Sequence[tuple[str, str]],
     readings: _Readings,
 ) -> dict[str, str]:
-    """Meaning of each column in words, by its name; of two tables by file and name.
+    """Meaning of each column in words, by its name; 'not used' if it has none.
 
-    `units`: unit of each joint and how it is known.
+    If there are two files, by 'file: name'. `units`: unit of each joint, and how it is known.
     """
     points, joints = pair.points, pair.joints
     table, columns = points
@@ -340,10 +352,10 @@ def _meanings_in_tables(
 def _column_meanings(
     columns: Columns, chain: SerialChain, units: Sequence[str], length: str
 ) -> dict[int, str]:
-    """Meaning of each column in words, by column index from 0; unused columns are left out.
+    """Meaning of each used column in words, by column index from 0.
 
-    `units`: text on the unit of each joint; columns of points only if `length`, their unit, is
-    given.
+    `units`: unit of each joint as text; `length`: unit of the points as text, '' to leave out
+    their columns.
     """
 
     def how(i: int) -> str:

@@ -25,8 +25,9 @@ _COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
 def with_poses(table: TextTable) -> TextTable:
     """Table with X, Y, Z and quaternion in place of the sixteen columns of each 4×4 matrix.
 
-    The seven columns, named ``pose x`` to ``pose qw`` by the matrix's name, are in `groups` and
-    `turns` of the table. Sixteen columns that are no rigid motion in any row stay as they are.
+    The seven columns, named ``pose x`` to ``pose qw`` by the matrix's name, are in `groups`
+    and `turns` of the result. Sixteen columns of which a row is no rigid motion stay as they
+    are; a table without matrices is returned unchanged.
     """
     names, rows = list(table.names), [list(row) for row in table.rows]
     dropped: set[int] = set()
@@ -62,9 +63,10 @@ def with_poses(table: TextTable) -> TextTable:
 
 
 def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
-    """Sixteen columns of each matrix, row by row or as counted, by the matrix's name.
+    """Sixteen column indices of each 4×4 matrix, by the matrix's name in the headers.
 
-    Indices and counts in headers begin with 0 or 1. {} if there are none.
+    In the order of row and column, or of one count; both begin with 0 or 1 in the headers. {}
+    if there are none.
     """
     found: dict[str, list[int]] = {}
     for pattern, counts in ((_ROW_AND_COLUMN, SIZE), (_COUNTED, COUNT)):
@@ -84,9 +86,10 @@ def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
 
 
 def _matrices_by_place(table: TextTable) -> Mapping[str, list[int]]:
-    """Sixteen adjacent columns of each rigid motion in a table without names.
+    """Sixteen adjacent column indices of each 4×4 matrix in a table without headers.
 
-    By ``pose``, or ``pose 1``, ``pose 2``, …; {} if there are none.
+    Columns that are a rigid motion in every row. The keys are ``pose`` for a single one, else
+    ``pose 1``, ``pose 2``, …; {} if there are none.
     """
     found: dict[str, list[int]] = {}
     first = 0
@@ -106,7 +109,7 @@ def _matrices_by_place(table: TextTable) -> Mapping[str, list[int]]:
 
 
 def _numbers(table: TextTable, columns: list[int]) -> FloatArray | None:
-    """Numbers of columns, (n, 16); None if one is missing or no number."""
+    """Numbers of the columns, (n, len(columns)); None if a cell is empty or no number."""
     try:
         cells = [[table.number(row, i) for i in columns] for row in range(len(table.rows))]
     except InputError:

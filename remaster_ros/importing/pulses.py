@@ -20,16 +20,17 @@ _UNIT = re.compile(rf'\s*[\[(]?\b(?:{"|".join(PULSES)})\b[\])]?\s*$', re.IGNOREC
 
 
 def in_degrees(joints: Table, per_degree: tuple[float, ...], angles: str) -> tuple[Table, str]:
-    """Table of joints in degrees, and a sentence on the conversion ('' if they are no pulses).
+    """Table of joints converted from motor pulses to degrees, and a sentence on it.
 
-    `per_degree`: pulses of a degree for each joint, base to tip; () if not given. `angles`: unit
-    that the user stated, '' if none. The headers of converted columns end in ``[deg]``.
+    `per_degree`: pulses of a degree for each joint, base to tip; all joints are divided by it.
+    () if the user gave none: the table is returned as it is, with ''. `angles`: unit that the
+    user stated, '' if none. The headers of converted columns end in ``[deg]``.
 
     Raises
     ------
     InputError
-        The joints are in pulses and `per_degree` is not given, or its number is not that of the
-        joints.
+        The joints are in pulses and `per_degree` is not given, or its number is not that of
+        the joints.
     """
     table, columns = joints
     headers = [table.names[i] for i in columns.joints]

@@ -62,9 +62,9 @@ class RawRows:
     effort: FloatArray | None = None  # Measured torques, N m, (n, k); None if not measured
 
     def in_order(self) -> RawRows:
-        """Rows sorted by their times, with a warning unless these rise already.
+        """Rows sorted by their times, with a warning added if they were not sorted.
 
-        Unchanged without times, too.
+        The same rows if they have no times, or these rise already.
         """
         if self.stamp_s is None:
             return self
@@ -86,9 +86,10 @@ class RawRows:
 
 
 def from_tool(rows: RawRows) -> RawRows:
-    """Rows of a sensor on the tool, with the pose of the sensor in the frame of its target.
+    """Rows of a sensor on the tool with each measured pose inverted.
 
-    Inverse of the measured pose of the target in the sensor's frame.
+    `position` and `orientation` become the pose of the sensor in the frame of its target, in
+    place of that of the target in the sensor's frame.
 
     Raises
     ------
@@ -108,9 +109,10 @@ def from_tool(rows: RawRows) -> RawRows:
 
 
 def moving_markers(raw: FloatArray) -> BoolArray:
-    """Mask of the markers in (markers, n, 3), NaN for missing readings, that move with the arm.
+    """Mask of the markers that move with the arm, (markers,).
 
-    A marker does if its extent along an axis is over 2 % (`STATIC`) of the largest one's.
+    A marker does if its extent along an axis is over 2 % (`STATIC`) of the largest one of all
+    markers. `raw`: readings, (markers, n, 3), NaN where missing; a marker never seen does not.
     """
     seen = np.isfinite(raw[:, :, 0])
     extent = np.array(

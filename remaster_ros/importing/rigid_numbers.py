@@ -14,10 +14,10 @@ _ROUNDING = 2e-3
 
 
 def rigid(numbers: FloatArray) -> FloatArray | None:
-    """Rigid motions (n, 4, 4) from sixteen numbers each, (n, 16); None if any is none.
+    """Rigid motions, (n, 4, 4), from sixteen numbers each, (n, 16); None unless all are rigid.
 
-    The place of the row 0 0 0 1 decides between rows and columns, which libfranka writes. The
-    product of a rotation matrix and its transpose may be 2e-3 off the identity.
+    Numbers are row by row, or column by column as libfranka writes them: the place of 0 0 0 1
+    decides. The product of a rotation matrix and its transpose may be 2e-3 off the identity.
     """
     T = numbers.reshape(-1, SIZE, SIZE)
     for each in (T, T.swapaxes(1, 2)):

@@ -50,17 +50,18 @@ class TableOptions:
 def read_rows(
     files: Sequence[Path | TextTable], chain: SerialChain, options: TableOptions
 ) -> RawRows:
-    """Rows of one table with joints and points, or of one table of each, in SI.
+    """Rows in SI of one table with joints and points, or of a table of joints and one of points.
 
-    Read from files or tables in memory, at most two, and joined; of streams the means at
-    standstills are taken. A .dat and a .src file of one name are one table of a KUKA controller.
+    From files or tables in memory, at most two, which are joined; of streams the means at
+    standstills are taken. A .dat and a .src file of one name are one table of a KUKA
+    controller.
 
     Raises
     ------
     InputError
         One line naming file, line, column and remedy: more files, unclear or missing columns,
-        another number of joints than the robot's, cells that are no numbers, or rows that cannot
-        be joined.
+        another number of joints than the robot's, cells that are no numbers, or rows that
+        cannot be joined.
     """
     tables, found = assign_columns(_read_files(files, options), chain, options.chosen)
     points, joints = points_and_joints(tables, found)
@@ -80,10 +81,11 @@ def read_rows(
 
 
 def _read_files(files: Sequence[Path | TextTable], options: TableOptions) -> list[TextTable]:
-    """Tables in memory, then those of the files; points of KUKA in the order of their program.
+    """Tables in memory, then those of the files, in this order.
 
-    Raises InputError for more than two files, a .dat and a .src file of one name counted once, and
-    for a file that cannot be read.
+    A KUKA program (.src) puts the points of the data file (.dat) of the same name into the
+    order of its moves, and counts as no file of its own. Raises InputError for more than two
+    files, or one that cannot be read.
     """
     read_before = [file for file in files if isinstance(file, TextTable)]
     paths = [file for file in files if isinstance(file, Path)]
@@ -115,8 +117,9 @@ def _read_files(files: Sequence[Path | TextTable], options: TableOptions) -> lis
 def _in_move_order(data: TextTable, program: Path) -> TextTable:
     """Positions of a KUKA data file (.dat) in the order of the moves of its program (.src).
 
-    As often as there are moves; positions without a move are dropped. If no move names one, the
-    order stays, with a note.
+    A position is repeated as often as the program moves to it, and dropped if it never does.
+    Moves to unknown positions are left out, with a note. If no move names a position of the
+    file, the rows stay as they are, with a note.
     """
     text, _ = decode(read_limited(program, TABLE_LIMIT, 'name the program'), program, '')
     named = [row[0] for row in data.rows] if data.names[0] == 'name' else []
@@ -134,7 +137,10 @@ def _in_move_order(data: TextTable, program: Path) -> TextTable:
 
 
 def _notes(tables: Sequence[TextTable], points: Table, joints: Table) -> tuple[str, ...]:
-    """Notes of the tables, and a sentence on each sheet or array that is used for neither."""
+    """Notes of the tables, and a sentence on each sheet or array that is not used.
+
+    `points`, `joints`: the tables that are used.
+    """
     return (
         *(note for table in tables for note in table.notes),
         *(
@@ -165,10 +171,10 @@ def _with_joints_of_robot(pair: PairedTables, chain: SerialChain) -> PairedTable
 
 
 def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
-    """Table of joints without axes beyond the first `count` that are 0 throughout.
+    """Table of joints without the axes beyond the first `count`, if these are 0 in all rows.
 
-    A controller that has seven axes writes 0 for the seventh of an arm with six. Last result: the
-    names of the axes left out.
+    A controller of seven axes writes 0 for the seventh of an arm with six. Last result: the
+    names of the axes left out; [], with the table as it is, if there are none or one is not 0.
     """
     table, columns = joints
     beyond = columns.joints[count:]
@@ -179,7 +185,10 @@ def _without_unused_axes(joints: Table, count: int) -> tuple[Table, list[str]]:
 
 
 def _with_joints_in_degrees(pair: PairedTables, options: TableOptions) -> PairedTables:
-    """Tables whose joints were converted from pulses of the motors, if they are pulses."""
+    """Tables with joints converted from motor pulses to degrees, if the user stated the ratios.
+
+    Else as they are. Raises InputError as `in_degrees`.
+    """
     joints, how_pulses = in_degrees(pair.joints, options.pulses_per_degree, options.angles)
     points = joints if pair.joints is pair.points else pair.points
     return replace(pair, points=points, joints=joints).noting(filter(None, [how_pulses]))
@@ -188,9 +197,11 @@ def _with_joints_in_degrees(pair: PairedTables, options: TableOptions) -> Paired
 def _at_standstills(
     pair: PairedTables, chain: SerialChain, options: TableOptions
 ) -> PairedTables | None:
-    """Means at standstills if the joints are a stream; None if not, or if rows are to be joined.
+    """Tables of the means at standstills, if the joints are a stream; None if they are not.
 
-    Rows are to be joined if the user chose names or times for it, or if both tables have names.
+    None also if the rows are to be joined: the user chose names or times for it, or no times,
+    or both tables share names; but not if a clock offset is stated. Raises InputError as
+    `stopped`.
     """
     points, joints = pair.points, pair.joints
     in_order = options.join == 'order'
@@ -210,10 +221,11 @@ def _at_standstills(
 
 
 def _without_incomplete_rows(pair: PairedTables) -> PairedTables:
-    """Tables without rows that lack joints or a point, with sentences on what is left out.
+    """Tables without rows that lack the joints or the point, with sentences on what is left out.
 
-    A row lacks them if all their cells are missing; in data frames if any is, unless the columns
-    are more than the joints. If all rows do, none is left out.
+    In files a row lacks them if all cells are missing. In data frames one missing cell is
+    enough, except for points of so many markers that they have more columns than there are
+    joints. Nothing is left out if all rows lack them.
     """
     points, joints = pair.points, pair.joints
     same = points[0] is joints[0]
@@ -243,7 +255,10 @@ def _without_incomplete_rows(pair: PairedTables) -> PairedTables:
 
 
 def _joined(pair: PairedTables, options: TableOptions) -> PairedTables:
-    """Tables whose rows belong together: joined by name, time or order if they are two."""
+    """Tables whose rows belong together: two tables are joined by name, time or order.
+
+    One table with both is returned as it is. Raises InputError as `join`.
+    """
     points, joints = pair.points, pair.joints
     if joints[0] is points[0]:
         return pair

@@ -54,7 +54,7 @@ ON_TOOL = '; poses that a camera on the tool has of a board that stands need --o
 
 @dataclass(frozen=True)
 class Sense:
-    """Result of trying the table against the robot."""
+    """Result of fitting a table to the robot: whether it fits, the finding, and the remedy."""
 
     fits: bool  # Whether the table fits the robot without a change
     sentence: str  # The finding, for people
@@ -73,9 +73,10 @@ def check_sense(
 ) -> Sense:
     """Fit the table to the robot and, if the error is gross, look for the mistake in it.
 
-    A table fits if its errors are within 5 mm and zero-offsets within 5 degrees, not over a tenth
-    of a sensor's rows are off, and markers are within 5 mm or 5.5 of their stated standard
-    deviations. Nothing is raised for too few data: such a table does not fit.
+    A table fits if its errors are within 5 mm and zero-offsets within 5 degrees, not over a
+    tenth of a sensor's rows are outliers, and markers are within 5 mm or 5.5 of their stated
+    standard deviations. Points that are computed from the joints do not fit. Nothing is raised
+    for too few data: such a table does not fit.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def check_sense(
     progress
         Called with the step and the fraction done.
     never_mastered
-        Whether zero-offsets may be larger than those of a mastered robot.
+        Whether zero-offsets up to 45 degrees are accepted, too.
     """
     # The marker is left free: one that is firm at a wrong place would bend the fit.
     part = replace(session, marker_std_m=UNKNOWN_MARKER_STD_M)
@@ -161,8 +162,9 @@ def check_sense(
 def _is_computed_from_joints(session: Session, chain: SerialChain) -> bool:
     """Whether the points of all markers are computed from the joints by the nominal arm.
 
-    The median distance from it, in its base frame, is below 20 µm: no sensor measures an arm to
-    `COMPUTED_M`, and none knows the base frame that well.
+    So if the median distance of each marker's points from a fixed point of the nominal tool,
+    in the base frame, is up to 20 µm (`COMPUTED_M`): no sensor is so exact, or knows the base
+    frame so well.
     """
     m = session.measurements
     for marker in range(len(session.markers)):
@@ -216,9 +218,10 @@ def _too_few(session: Session, joints: int) -> str:
 
 
 def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sense | None:
-    """Finding that some markers fit when each is taken by itself; None if no marker fits.
+    """Finding that markers fit when each is fitted alone, though not together; None if none does.
 
-    `error_text`: error of the fit of all, for the sentence.
+    The result does not fit; its options name the first such marker. `error_text`: error of the
+    fit of all markers, for the sentence.
     """
     m = session.measurements
     fitting: dict[str, float] = {}
@@ -248,10 +251,9 @@ def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sen
 
 
 def _outlying_rows(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
-    """Rows of the table that do not fit, with their distances, m, the farthest first.
+    """Rows of the table that do not fit: file and line, and distance, m, the farthest first.
 
-    Rows that are certainly gross and over 10 mm (`BENT_M`) from the fit. A row is named by file
-    and line.
+    Those that `off` has as gross errors and that are over 10 mm (`BENT_M`) from the fit.
     """
     found = np.flatnonzero(off.off & (off.error_m > BENT_M))
     order = found[np.argsort(-off.error_m[found], kind='stable')]
@@ -261,14 +263,20 @@ def _outlying_rows(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple
 
 
 def _outlier_warning(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
-    """Warning about rows that do not fit, with the remedy; '' if there are none."""
+    """Warning about rows that do not fit, with the remedy; '' if `outlying` is empty.
+
+    `outlying`: file and line, and distance, m, of each; `rows`: all rows, for their number.
+    """
     return (
         f'{_outliers_text(outlying, rows)}; correct these rows or remove them' if outlying else ''
     )
 
 
 def _outliers_text(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
-    """Number of rows that do not fit, their distances, and the first five of them, as text."""
+    """Number of rows that do not fit, their distances, and the first five of them, as text.
+
+    `outlying`: file and line, and distance, m, of each, at least one.
+    """
     shown = [
         f'{where.rpartition("/")[2]} ({shown_mm(error)})' for where, error in outlying[:SHOWN_ROWS]
     ]
@@ -286,7 +294,10 @@ def _outliers_text(outlying: Sequence[tuple[str, float]], rows: RawRows) -> str:
 def _too_many_outliers(
     given: Fitted, outlying: tuple[tuple[str, float], ...], rows: RawRows
 ) -> Sense:
-    """Finding that more rows are off than a fit would leave out."""
+    """Finding, for a table that does not fit, that more rows are off than a fit leaves out.
+
+    `given`: fit of the table as it is; `outlying`: rows that are off, with distances, m.
+    """
     return Sense(
         False,
         f'half of the rows fit to {shown_mm(given.error_m)}, but '
@@ -302,7 +313,9 @@ def _too_many_outliers(
 def _unmastered(given: Fitted, error_text: str, chain: SerialChain, never_mastered: bool) -> Sense:
     """Finding that zero-offsets are larger than those of a mastered robot, with the remedy.
 
-    Joints off by over 5 degrees (`LARGEST_OFFSET`) are named. The table fits if `never_mastered`.
+    Joints off by over 5 degrees (`LARGEST_OFFSET`) are named. The table counts as fitting only
+    if `never_mastered`. `given`: fit of the table as it is; `error_text`: its error, for the
+    sentence.
     """
     far = np.flatnonzero(np.abs(given.joint_offsets) > LARGEST_OFFSET * given.per_radian)
     listed = ' and '.join(
@@ -329,7 +342,11 @@ def _unmastered(given: Fitted, error_text: str, chain: SerialChain, never_master
 
 
 def _nothing_found(given: Fitted, error_text: str, chain: SerialChain, oriented: bool) -> Sense:
-    """Finding that the table does not fit and no known mistake explains it."""
+    """Finding that the table does not fit and no known mistake explains it.
+
+    `given`: fit of the table as it is; `error_text`: its error, for the sentence; `oriented`:
+    whether a sensor off the tool measured orientations, which adds advice on --on-tool.
+    """
     equal = np.abs(given.joint_offsets) / given.per_radian
     worst = int(np.argmax(equal))
     if chain.slides.any():

@@ -20,7 +20,7 @@ QUARTER_DEG = 90.0
 
 @dataclass(frozen=True)
 class Stretch:
-    """A change of a range of observations; `until` is excluded, None is the first or the end."""
+    """A change of the observations from number `since` to before `until`; None: no such bound."""
 
     what: str
     since: int | None = None
@@ -43,7 +43,7 @@ def arrangement_of(
     turn: tuple[str, float] = ('', 0.0),
     tip_link: str = '',
 ) -> Arrangement:
-    """Arrangement of a session by the user's corrections.
+    """Arrangement of a session's joint columns and points by the user's corrections.
 
     Parameters
     ----------
@@ -113,7 +113,8 @@ def arrangement_of(
 def corrected_session(session: Session, arrangement: Arrangement) -> Session:
     """Session with a correction applied to all its rows, reference visits included.
 
-    The session itself if the arrangement changes nothing. Raises InputError as `_controller`.
+    The session itself if the arrangement changes nothing. Raises InputError if a joint is to
+    be coupled whose controller has it coupled or moved already.
     """
     if arrangement == Arrangement.given(len(arrangement.order)):
         return session
@@ -136,10 +137,11 @@ def corrected_session(session: Session, arrangement: Arrangement) -> Session:
 def _controller(
     session: Session, arrangement: Arrangement, joint_names: Sequence[str]
 ) -> Controller | None:
-    """How the controller counts the joints after their columns were rearranged.
+    """Unit, sign, zero and coupling by which the controller counts each joint, after a correction.
 
-    The session's own (or None) if joints stay as they are. Raises InputError for --couple if the
-    joints concerned are coupled or moved already.
+    The session's own controller (or None) if the arrangement leaves the joints as they are.
+    Raises InputError for --couple if one of the two joints is coupled already, or the second
+    has a zero of its own.
     """
     plain = Arrangement.given(len(joint_names))
     of_joints = (arrangement.order, arrangement.signs, arrangement.quarters, arrangement.coupled)
@@ -196,7 +198,7 @@ def _marker_pair(text: str, session: Session) -> tuple[int, ...]:
 
 
 def _index(name: str, names: Sequence[str], option: str) -> int:
-    """Index of a name, from 0. Raises InputError, with the option, if it is unknown."""
+    """Index of a name in `names`, from 0. Raises InputError, with `option`, if it is absent."""
     if name not in names:
         raise InputError(
             f'{option}: there is no {name!r}; there are {", ".join(names)}'

@@ -38,7 +38,7 @@ _ALIKE = 0.9
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Pairs of standstills of points and of joints."""
+    """Pairs of standstills of points and of joints, with the offset between their clocks."""
 
     # Indices, (n,) each.
     points: IntArray
@@ -76,12 +76,13 @@ def match(
     chain: SerialChain,
     offset_s: float | None = None,
 ) -> Matching:
-    """Pair the standstills of points with those of the joints, rad.
+    """Pair the standstills of points with those of the joints (mean: rad, (n, k)).
 
-    `names` are those of points and joints, for messages; `offset_s` is the clock offset, s, None
-    to find it. The best one has pairs that the robot fits to 15 % of the points' extent, if there
-    are 11 or more, else the most pairs; equal clocks and equal numbers in order are tried, too.
-    Raises InputError if nothing stood still, no offset joins them, or several do equally well.
+    `names`: of the streams of points and of joints, for messages. `offset_s`: added to the
+    points' times to have the joints', s; None to find the best of many, of equal clocks, and
+    of pairs by order if both are equally many. The best has pairs that the robot fits to 15 %
+    of the points' extent, if there are 11 or more, else the most pairs. Raises InputError if
+    nothing stood still, no offset joins them, or several do equally well.
     """
 
     def error_of(i: IntArray, j: IntArray) -> float:
@@ -163,11 +164,13 @@ def _matching(
     offset: float,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
-    """Pairs of standstills that overlap with a clock offset, s, with the refined offset.
+    """Pairs of standstills that overlap with a clock offset, and the refined offset, s.
 
-    Each standstill of the joints gets one of the points, with which it shares over half of the
-    shorter one's time; of shots all that fall into it. ``apart_s`` is the median difference of
-    begins and ends then. No pairs if none overlap.
+    `offset`: added to the points' times, s. Each standstill of the joints gets the one of
+    points with which it shares most time, over half of the shorter one's; or all single shots
+    that fall into it. ``apart_s`` is the median difference of begins and ends after the
+    refined offset, None for shots. No pairs if none overlap. `error_of`: residual of the robot
+    for index arrays of pairs.
     """
     begin, end = points.begin + offset, points.end + offset
     before = np.searchsorted(joints.end, begin)
@@ -210,9 +213,11 @@ def _judged(
     difference: float | None,
     error_of: Callable[[IntArray, IntArray], float],
 ) -> Matching:
-    """Matching of pairs (indices of points `i` and joints `j`), with the residual of the robot.
+    """Matching of given pairs, with the residual by which the robot fits them.
 
-    The residual is None for fewer than 11 pairs. `offset`, `difference`: s.
+    `i`, `j`: indices of points and joints, (n,); `offset`: of the clocks, s; `difference`: of
+    begins and ends, s; `error_of`: residual of pairs as a share of the points' extent. The
+    residual is None for fewer than 11 pairs.
     """
     error = error_of(i, j) if len(i) >= FEWEST_FOR_ROBOT else None
     return Matching(i, j, offset, difference, error)
@@ -221,8 +226,9 @@ def _judged(
 def _offsets(points: Standstills, joints: Standstills) -> list[float]:
     """Clock offsets, s, that bring many standstills together, the likeliest first.
 
-    To be added to the points' times; 60 at most, over 0.3 s apart, each with at least half as many
-    begins and ends as the best.
+    To be added to the points' times. 60 at most, over 0.3 s apart, each with at least half as
+    many coinciding begins and ends as the best one; of single shots those of
+    `_offsets_of_shots`.
     """
     if points.shots:
         return _offsets_of_shots(points.begin, joints)
@@ -245,9 +251,10 @@ def _offsets(points: Standstills, joints: Standstills) -> list[float]:
 
 
 def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
-    """Clock offsets, s, with which most shots fall into standstills: the middle of each range.
+    """Clock offsets, s, with which most single shots fall into standstills of the joints.
 
-    The likeliest first, 60 at most. `shots`: their times, s.
+    The likeliest first, 60 at most; each is the middle of a range. `shots`: their times, s,
+    (n,).
     """
     starts = (joints.begin[None] - shots[:, None]).ravel()
     stops = (joints.end[None] - shots[:, None]).ravel()

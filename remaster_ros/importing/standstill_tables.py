@@ -148,11 +148,12 @@ def _by_order(
     names: tuple[str, str],
     is_stated: bool,
 ) -> Stopped:
-    """Pair points without times with equally many standstills, if the robot agrees or `is_stated`.
+    """Pair points with as many standstills by their order, if the robot agrees or `is_stated`.
 
     The robot agrees if it fits the first marker of 11 points or more to 15 % of their extent.
-    `reported`: times of the joints' rows, s; `unit`: of their angles, rad. Raises InputError if
-    the numbers differ or the robot disagrees.
+    `still`: standstills of the joints; `reported`: times of the joints' rows, s; `unit`: of
+    their angles, rad; `names`: of both tables, for messages; `is_stated`: whether the user
+    asked for it. Raises InputError if the numbers differ or the robot disagrees.
     """
     raw = numbers(points[0], points[1].point, optional=True)
     rows = np.flatnonzero(np.isfinite(raw).any(axis=1))
@@ -207,9 +208,10 @@ def _unpaired(
 
 
 def _lost(count: int, kept: IntArray, name: str) -> tuple[str, ...]:
-    """Sentence on the standstills without a point; () if there are none.
+    """Warning how many standstills of a table have no point, as a tuple; () if none.
 
-    `count`: of all standstills; `kept`: indices of those with a point.
+    `count`: number of standstills; `kept`: indices of those with a point; `name`: of the table
+    of joints.
     """
     lost = count - len(np.unique(kept))
     return (f'{lost} standstills of {name} without a point were left out',) * bool(lost)
@@ -221,7 +223,10 @@ def _extent(values: FloatArray) -> float:
 
 
 def _rows_of(stamps: FloatArray, when: FloatArray) -> IntArray:
-    """Index in `when` of each stamp; equal stamps are different rows, in order."""
+    """Index in `when` of each stamp, (n,): each stamp is one of `when`.
+
+    A stamp that is repeated gets the next row with this time.
+    """
     order = np.argsort(when, kind='stable')
     sorted_when = when[order]
     taken: dict[float, int] = {}
@@ -240,10 +245,11 @@ def _scale(
     windows: FloatArray,
     still: Standstills,
 ) -> float:
-    """Scale of the points to m, from their unit; 1 if no window has a point.
+    """Unit of the points, m; 1 if there is no point at any standstill.
 
-    By the stated unit (`stated_unit`), the header, or the modelled tool at the standstills.
-    `windows`: begin and end of each by the points' clock, s, (n, 2).
+    The unit that the user stated (`stated_unit`, '' if none), else that of the header, else by
+    the size of the modelled motion of the tool. `stream`: points of a marker; `windows`: begin
+    and end of each standstill of `still` by the points' clock, s, (n, 2).
     """
     parts = [stream.values[between(stream, *window)] for window in windows]
     seen = [j for j, part in enumerate(parts) if len(part)]
@@ -257,11 +263,12 @@ def _scale(
 def _means(
     points: Table, when: FloatArray, windows: FloatArray, scale: float
 ) -> tuple[IntArray, Table, int]:
-    """Indices of the standstills with a point, and the table of their mean points.
+    """Indices of the standstills with a point of any marker, and the table of their mean points.
 
-    Columns for standard deviations and the number of samples are added at the end. Last result:
-    the number of readings left out because the marker was not still. `windows`: begin and end of
-    each standstill by the clock of `when`, s, (n, 2); `scale`: unit of the points, m.
+    Columns for standard deviations and the number of samples are added at the end. Last
+    result: the number of readings (standstill and marker) left out because the marker was not
+    still. `windows`: begin and end of each standstill by the clock of `when`, s, (n, 2);
+    `scale`: unit of the points, m.
     """
     table, columns = points
     spread = {

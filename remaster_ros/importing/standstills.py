@@ -46,7 +46,7 @@ def refuse_sliding(chain: SerialChain, path: Path) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Values reported over time."""
+    """Values reported over time: n stamps, s, with m values each."""
 
     # s, rising, (n,).
     stamps: FloatArray
@@ -120,9 +120,9 @@ def joint_standstills(stream: Stream, fewest: int = 1) -> Standstills:
 def point_standstills(stream: Stream) -> Standstills:
     """Standstills of a marker, in any unit; empty if it never stood still.
 
-    Longer than 0.5 s, of three values or more that span up to ten standard deviations of the
-    quietest tenth, or 1e-4 of the extent. If that is over 1 % of the extent, the marker never
-    stood still.
+    Longer than 0.5 s, of three values or more that span up to the tolerance: ten standard
+    deviations of the noise (quietest tenth of the stream), or 1e-4 of the extent if that is
+    more. If the tolerance is over 1 % of the extent, the marker never stood still.
     """
     # A frame that jumps is no motion.
     values = _median_of_five(stream.values)
@@ -147,9 +147,10 @@ def _median_of_five(values: FloatArray) -> FloatArray:
 
 
 def _quietest(stream: Stream) -> float:
-    """Standard deviation in the quietest part of a stream, of its noisiest column.
+    """Standard deviation of the noise: that in the quietest tenth of a stream, 0 if unknown.
 
-    The 10 % quantile over blocks of 0.5 s, of at least five values; 0 if there is no whole block.
+    The 10 % quantile over blocks of 0.5 s, at least five values, each with its noisiest
+    column. 0 if the stream is shorter than a block.
     """
     step = float(np.median(np.diff(stream.stamps))) if len(stream.stamps) > 1 else SWING_S
     size = max(FEWEST_SAMPLES, round(SWING_S / max(step, 1e-4)))
@@ -163,8 +164,8 @@ def _quietest(stream: Stream) -> float:
 def _standstills(stream: Stream, tolerance: float, fewest: int) -> Standstills:
     """Runs, longer than `SWING_S`, of at least `fewest` values that span `tolerance` or less.
 
-    The span is that of each column. A gap between stamps, over 0.5 s and over three usual steps,
-    ends a run.
+    The span is that of each column, in the unit of the values. A gap between stamps, over 0.5
+    s and over three usual steps, ends a run.
     """
     stamps, values = stream.stamps, stream.values
     step = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0

@@ -21,10 +21,11 @@ from remaster_ros.kinematics.serial_chain import SerialChain
 def assign_columns(
     tables: list[TextTable], chain: SerialChain, chosen: ColumnChoice
 ) -> tuple[list[TextTable], list[Table]]:
-    """Tables, with poses as points if they have matrices, and those whose columns have a meaning.
+    """Tables, with points in place of 4×4 matrices, and those whose columns have a meaning.
 
-    The second result is the one sheet or array with joints and points if a workbook or an archive
-    has one. Raises InputError for columns that are unclear, or chosen and absent.
+    The second result has each table with its columns. If all are sheets or arrays, and just
+    one has joints and points, it is that one alone. Raises InputError for columns that are
+    unclear, or chosen and absent.
     """
     if not (chosen.joints or chosen.points):
         # Column numbers that the user gave count the columns of the file as it is.
@@ -68,7 +69,10 @@ def points_and_joints(tables: Sequence[TextTable], found: list[Table]) -> tuple[
 
 
 def unused_points(found: list[Table], used: TextTable) -> list[str]:
-    """Sentences on the points of other tables than the one that is used."""
+    """Sentences on the points of tables other than `used`, which has the points that are used.
+
+    Only tables with columns that the user chose, if there are such.
+    """
     return [
         f'{table.path}: {", ".join(table.names[i] for i in columns.point)} left out, the points '
         f'are in {used.path}'
@@ -80,9 +84,10 @@ def unused_points(found: list[Table], used: TextTable) -> list[str]:
 def _with_columns(
     tables: list[TextTable], chain: SerialChain, chosen: ColumnChoice
 ) -> list[Table]:
-    """Tables with the meaning of their columns; sheets and arrays without any are left out.
+    """Tables with the meaning of their columns; unclear sheets and arrays are left out.
 
-    Raises InputError for another table without, or if no sheet or array has points or joints.
+    Raises InputError for an unclear table that is no sheet or array, or if no table that is
+    left has points or joints.
     """
     sliding = np.flatnonzero(chain.slides).tolist()
     found, problems = [], []
@@ -103,9 +108,10 @@ def _with_columns(
 def _choice_for_table(
     chosen: ColumnChoice, table: TextTable, tables: Sequence[TextTable]
 ) -> ColumnChoice:
-    """Chosen columns that concern one table: numbers count only for a table without names.
+    """Chosen columns that concern one table, as `_choice_for_file`.
 
-    If all `tables` have names, numbers count for all. See `_choice_for_file`.
+    If some of `tables` have column names and some have none, column numbers are left out for a
+    table with names.
     """
     of_table = _choice_for_file(chosen, table.path, [text_table.path for text_table in tables])
     if not table.has_header or all(text_table.has_header for text_table in tables):
@@ -120,7 +126,8 @@ def _choice_for_table(
 def _choice_for_file(chosen: ColumnChoice, path: Path, paths: Sequence[Path]) -> ColumnChoice:
     """Chosen columns that concern one file: `joints.txt:1-6` is for that file alone.
 
-    Ranges are expanded to their numbers. `paths`: all files.
+    Columns without a file's name concern every file. Ranges are expanded to their numbers.
+    `paths`: all files.
     """
     of_file: dict[str, tuple[str, ...]] = {}
     for kind, names in (('joints', chosen.joints), ('points', chosen.points)):

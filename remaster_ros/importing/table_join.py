@@ -56,11 +56,12 @@ def join(
     how: JoinCriterion = '',
     within_s: float = 1.0,
 ) -> Pairs:
-    """Pair the rows of two tables by name, time or order, or by the first of these that works.
+    """Pair the rows of two tables by name, time or order.
 
-    By order unasked only for data frames whose rows were counted alike. `within_s`: largest
-    difference of times, s. Raises InputError if nothing pairs them, a name is twice, no times are
-    near, every point was measured in motion, or the numbers of rows differ for ``order``.
+    `how`: '' for the first of these that works; by order then only for data frames whose rows
+    were counted alike. `within_s`: largest difference of times, s. Raises InputError if
+    nothing pairs them, a name is twice, no times are near, every point was measured in motion,
+    or the numbers of rows differ for ``order``.
     """
     if how in ('', 'name'):
         pairs = _pairs_by_name(points, joints, by_header=how == '')
@@ -149,11 +150,11 @@ def _possible_name_columns(table: TextTable, columns: Columns) -> list[int]:
 def _best_name_columns(
     points: Table, joints: Table, level: int, columns: Iterable[tuple[int, int]], sure: bool
 ) -> tuple[int, int, list[str], list[str]] | None:
-    """The pair of columns with most names in common at one level of `_comparison_keys`.
+    """Pair of columns with most names in common at one level of `_comparison_keys`; None without.
 
-    As in `common_names`; `columns`: the pairs to compare. If not `sure` (the header does not call
-    them names), one table must contain all names of the other, at least four. None if no pair
-    matches.
+    Result as of `common_names`. `columns`: the pairs to compare, (index in points, index in
+    joints); `sure`: False if the headers do not call them names: then one table must contain
+    all names of the other, at least four.
     """
     best: tuple[int, int, int, list[str], list[str]] | None = None
     for i, j in columns:
@@ -173,8 +174,9 @@ def _best_name_columns(
 def _pairs_by_name(points: Table, joints: Table, *, by_header: bool) -> Pairs | None:
     """Pairs of rows with equal names; None if the tables share none.
 
-    Rows whose name is not in the other table are left out, with a sentence. Raises InputError if a
-    common name is twice, in points only if these have neither sensors nor markers.
+    Rows whose name is not in the other table are left out, with a sentence. `by_header`: only
+    columns whose header says that they are names. Raises InputError if a common name is twice
+    in the joints, or in points that have neither a sensor nor a marker column.
     """
     best = common_names(points, joints, by_header)
     if best is None:
@@ -246,10 +248,10 @@ def _common_prefix_length(names: Sequence[str]) -> int:
 def _pairs_by_time(points: Table, joints: Table, within_s: float) -> Pairs | None:
     """Pairs of each point with the joints reported nearest in time, `within_s` at most.
 
-    None if a table has no times. Times of day without a date are moved by whole days. A point
-    between two reports that differ by over 0.05 degrees in a joint was measured in motion and is
-    left out. Raises InputError if no point is near, all were in motion, or rows of joints share a
-    time.
+    None if either table has no times. Times of day without a date are moved by whole days. A
+    point between two reports that differ by over 0.05 degrees in a joint was measured in
+    motion and is left out, with a sentence, as one without a near report is. Raises InputError
+    if no point is near a report, all were in motion, or different joints have the same time.
     """
     when, reported = times(*points), times(*joints)
     if when is None or reported is None:
@@ -304,10 +306,11 @@ def _span(times_s: FloatArray) -> str:
 def _refuse_equal_times(
     joints: Table, reported: FloatArray, order: IntArray, q: FloatArray, used: IntArray
 ) -> None:
-    """Raise InputError if a row of joints that a point needs has the time of another row.
+    """Raise InputError if a needed row of joints has the time of a row with other joints.
 
-    ``reported``: times of the joints, s, rising; ``order``: their row in the table; ``used``:
-    indices into ``reported`` of the rows that are needed.
+    ``reported``: times of the joints, s, rising, (n,); ``order``: row in the table of each;
+    ``q``: joints of the table's rows, (n, k); ``used``: indices into ``reported`` of the
+    needed rows.
     """
     table, columns = joints
     for at in np.unique(used):

@@ -99,7 +99,10 @@ class TextTable(NamedColumns):
     preamble: str = ''  # Title and comment lines
 
     def describe(self) -> str:
-        """Number of rows, separator, decimal sign and encoding, in a few words."""
+        """File, number of rows, separator, decimal sign and encoding, as text.
+
+        Of a maker's format its name in place of these, of a workbook or array 'rows of cells'.
+        """
         if self.kind:
             return f'{self.path}: {len(self.rows)} rows of {self.kind}'
         if self.encoding == CELLS:
@@ -367,7 +370,10 @@ def _table(
 
 
 def _bounded(table: TextTable) -> TextTable:
-    """The table. Raises InputError for over 5000 columns, or a name of over 1000 characters."""
+    """The table, unchanged.
+
+    Raises InputError for over 5000 columns, or a name of over 1000 characters.
+    """
     if len(table.names) > MOST_COLUMNS:
         raise _too_wide(table.path, min(table.lines, default=1), len(table.names))
     for name in table.names:
@@ -439,7 +445,8 @@ def decode(data: bytes, path: Path, encoding: str = '') -> tuple[str, str]:
 def _split(line: str, separator: str, path: Path, number: int) -> list[str]:
     """Cells of a line without outer blanks. Raises InputError if its quotes are not balanced.
 
-    For the separator ' ' any run of white space separates. `path`, `number`: for the message.
+    For the separator ' ' any run of white space separates, but not before a bracket, as of a
+    unit. `path`, `number`: for the message.
     """
     if separator == ' ':
         return _BLANKS.split(line.strip())
@@ -465,10 +472,11 @@ def _list_in_cell(cell: str) -> list[str]:
 def _with_lists_as_columns(
     split: list[tuple[int, str, list[str]]],
 ) -> list[tuple[int, str, list[str]]]:
-    """Lines (number, text, cells) with each list in a cell split into a column for each number.
+    """Lines of a table with each list in a cell split into a cell for each number.
 
-    The first line with lists decides on their lengths; a missing list becomes empty cells, a name
-    ``name x`` to ``name z`` for three numbers, else ``name 1`` and so on.
+    A line is its number, text and cells. The first line with lists decides on their lengths; a
+    missing list becomes empty cells, a name ``name x`` to ``name z`` for three numbers, else
+    ``name 1`` and so on.
     """
     first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_list_in_cell, cells))), [])
     widths = [len(_list_in_cell(cell)) for cell in first]
@@ -495,7 +503,7 @@ def _with_lists_as_columns(
 def _without_thousands_separators(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
     """Cells without the blanks or apostrophes between groups of three digits.
 
-    Not in columns that have a number of four digits without them.
+    Columns that also have a number of four or more digits without them are not changed.
     """
     columns = [*zip(*rows)]
     for i, column in enumerate(columns):
@@ -512,7 +520,11 @@ def _without_thousands_separators(rows: list[tuple[str, ...]]) -> list[tuple[str
 def _without_units(
     rows: list[tuple[str, ...]], header: list[str]
 ) -> tuple[list[tuple[str, ...]], list[str]]:
-    """Cells without the unit that all cells of a column have, and the header with that unit."""
+    """Rows and header, with the unit that all cells of a column have moved into the header.
+
+    A header that has a unit already keeps it. Columns without a header, with several units, or
+    with a cell without one, are not changed.
+    """
     header = list(header)
     columns = [*zip(*rows)]
     for i, column in enumerate(columns):
@@ -531,7 +543,7 @@ def _without_units(
 
 
 def _find_separator(lines: Sequence[str]) -> str:
-    """Separator that splits most rows into most cells with numbers; ' ' if none does.
+    """Separator that gives most cells with numbers in rows of the usual width; ' ' if none does.
 
     An earlier one of `SEPARATORS` is kept unless a later one gives over 1.25 times as many.
     """
@@ -577,8 +589,8 @@ def _is_row(cells: Sequence[str]) -> bool:
 def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
     """Whether a line below the header is a sum, a page title or a remark, not a damaged row.
 
-    `usual` are the columns that have numbers in most rows, in which a row that was cut off still
-    has some numbers.
+    `usual`: indices of the columns that have numbers in most rows, in which a row that was cut
+    off still has some numbers; False if there are none. `width`: number of columns.
     """
     if not len(usual):
         return False
@@ -598,10 +610,11 @@ def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
 def _first_row(
     split: list[tuple[int, str, list[str]]], path: Path, comment: re.Pattern[str]
 ) -> tuple[int, int, IntArray]:
-    """Number of columns, index of the first row, and the columns that have numbers in most rows.
+    """Number of columns, index of the first row, and indices of the usual columns of numbers.
 
-    The number of columns is that of most lines with two numbers. `split`: lines (number, text,
-    cells). Raises InputError if no line has two numbers.
+    The number of columns is that of most lines with two numbers; usual columns have numbers in
+    most of these. `split`: lines (number, text, cells). Raises InputError if no line has two
+    numbers.
     """
     rows = [
         (i, cells)
@@ -626,11 +639,11 @@ def _first_row(
 def _header(
     above: list[tuple[int, str, list[str]]], width: int, separator: str, path: Path
 ) -> tuple[list[str], str, int]:
-    """Names of the columns ([] if there are none), title lines above, and number of lines to skip.
+    """Names of the columns ([] if there are none), title lines, and index of the line behind them.
 
-    The number is 0 if there are no names. `above` are the lines before the first row. A line of
-    units below the names is put into them in brackets. Raises InputError if over half of such a
-    line are units, but not all.
+    The index is 0 if there are no names. `above` are the lines before the first row. A line of
+    units below the names is put into them in brackets. Raises InputError if over half of such
+    a line are units, but not all.
     """
     names: list[str] = []
     over: list[str] = []
@@ -665,13 +678,19 @@ def _header(
 
 
 def _are_counted(cells: Sequence[str]) -> bool:
-    """Whether names are only the numbers of their columns from 0 on, as programs write them."""
+    """Whether column names are only the numbers 0, 1, 2, …, as programs write them.
+
+    A first name that is empty (of an index) is skipped; False if fewer than two are left.
+    """
     given = [cell for cell in cells[:1] if cell] + [*cells[1:]]
     return len(given) >= _FEWEST_NUMBERS and given == [str(i) for i in range(len(given))]
 
 
 def _with_group_names(over: Sequence[str], names: list[str]) -> list[str]:
-    """Names with the group above them in front, for names that occur more than once."""
+    """Column names with the group's name in front, for names that occur more than once.
+
+    `over`: cells of the line above, in which an empty cell continues the group to its left.
+    """
     group, groups = '', []
     for cell in (*over, *[''] * (len(names) - len(over))):
         group = cell or group
@@ -684,7 +703,7 @@ def _with_group_names(over: Sequence[str], names: list[str]) -> list[str]:
 
 
 def _find_decimal(rows: Sequence[Sequence[str]]) -> str:
-    """Decimal sign: the last sign, point or comma, of most numbers that have one; else point."""
+    """Decimal sign of a table: ',' if it is the last sign of more numbers than '.', else '.'."""
     signs: Counter[str] = Counter()
     for cells in rows:
         for cell in cells:

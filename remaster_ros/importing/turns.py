@@ -46,9 +46,10 @@ def with_orientation(rows: RawRows, chain: SerialChain, options: SessionOptions)
     """Rows with quaternions of their orientation columns, or without orientations.
 
     The convention is the one that agrees with the arm to 0.1 rad (`AGREE_RAD`, median).
-    Orientations are dropped, with a warning, if they are computed by the robot, disagree with the
-    arm, or fit in several conventions. Quaternions are kept unjudged for several markers or
-    sensors, or a sensor on the tool. Rows without any are returned as they are.
+    Orientations are dropped, with a warning, if they are computed by the robot, disagree with
+    the arm or with the points, or fit in several conventions. Quaternions of stated order are
+    kept unchecked for several markers or sensors, or a sensor on the tool. Rows without
+    orientations are returned as they are.
     """
     if rows.ambiguous_orientation is None and rows.orientation is None:
         return rows
@@ -166,12 +167,12 @@ def _orientation_error(
     on_tool: bool,
     ignore_points: bool = False,
 ) -> float:
-    """Median difference of measured orientations from those of the arm, rad.
+    """Median difference of measured orientations from those of the nominal arm, rad.
 
-    `arms` are the tool poses, (n, 4, 4), for each way to count the joints; the best one counts. If
-    not `ignore_points`, it is inf if the sensor's orientation disagrees with the points by over
-    0.2 rad; also inf with fewer than 8 rows (`FEWEST_ROWS`). `xyzw`: quaternions, (n, 4), NaN if
-    unknown.
+    `xyzw`: quaternions, (n, 4), NaN if unknown; `arms`: tool poses, (n, 4, 4), for each way to
+    count the joints, of which the best counts. inf with fewer than 8 rows (`FEWEST_ROWS`) or,
+    unless `ignore_points`, if the sensor's orientation by these differs from that by the
+    points by over 0.2 rad.
     """
     known = np.flatnonzero(np.isfinite(xyzw).all(axis=1))
     if len(known) < FEWEST_ROWS:
@@ -198,9 +199,10 @@ def _orientation_error(
 
 
 def _sensor_rotation(position: FloatArray, T: FloatArray) -> Rotation:
-    """Rotation of the base in the sensor's frame, from the points (n, 3) of one marker.
+    """Rotation of the base frame in the sensor's frame, from the points, (n, 3), of one marker.
 
-    B p + e - R m = t is linear in the 15 numbers of B, e and m; B is the inverse rotation.
+    With B its inverse, e the sensor's origin, m the marker in the tool frame, and R, t the
+    tool poses in `T`, (n, 4, 4): B p + e - R m = t is linear in the 15 numbers of B, e and m.
     """
     n = len(T)
     A = np.zeros((3 * n, 15))

@@ -51,7 +51,10 @@ _OTHERS = {
 
 
 def other_unit(header: str) -> str:
-    """Unit at the end of a header that nothing converts, as written; '' if there is none."""
+    """Unit at the end of a header that is known but not converted (such as ``ft``), as written.
+
+    '' if there is none, or it can be converted.
+    """
     found = _IN_BRACKETS.search(header) or _AT_END.search(header)
     return found[1] if found and found[1].lower() in _OTHERS else ''
 

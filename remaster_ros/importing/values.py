@@ -98,7 +98,7 @@ def numbers(table: TextTable, columns: tuple[int, ...], optional: bool = False) 
 def angle_unit(table: TextTable, columns: Columns, stated_unit: str) -> tuple[str, str]:
     """Unit of the joint angles, and how it is known: 'told', 'header' or 'guessed'.
 
-    `stated_unit` is the user's, '' if none. Guessed are rad if all angles are below 2.1 π, else
+    `stated_unit`: by the user, '' if none. Guessed is rad if all angles are below 2.1 π, else
     deg. Raises InputError if the headers have several units.
     """
     units = {columns.units.get(i, '') for i in columns.joints} - {''}
@@ -120,9 +120,10 @@ def joint_values(
 ) -> tuple[FloatArray, tuple[tuple[str, str], ...], FloatArray]:
     """Joint positions, (n, k), rad or m; unit and source of each joint, k; and scale to SI, (k,).
 
-    The unit of the angles is `stated_unit`, else that of the header, else guessed. The unit of a
-    prismatic joint is in its header; else m if all values in m are within the joint's limits, else
-    mm if they are within the limits in mm. Raises InputError if neither fits.
+    The unit of the angles is `stated_unit` (by the user, '' if none), else that of the header,
+    else guessed. The unit of a prismatic joint is in its header; else m if all values in m are
+    within the joint's limits, else mm if they are within the limits in mm. Raises InputError
+    if neither fits, or for a unit or number that cannot be used.
     """
     values = numbers(table, columns.joints)
     turning = tuple(i for i, slides in zip(columns.joints, chain.slides) if not slides)
@@ -167,9 +168,10 @@ def length_unit(
 ) -> tuple[str, str]:
     """Unit of the points, and how it is known: 'told', 'header' or 'guessed'.
 
-    `points` are the points as written, (n, 3). If nothing states the unit, it is the one of m, mm
-    and in with which their spread is nearest to that of the points `modelled` of the robot, m, (n,
-    3). Raises InputError if the headers have several units.
+    `stated_unit`: by the user, '' if none; `points`: as written, (n, 3). If neither user nor
+    table states it, it is the one of m, mm and in with which their spread is nearest to that
+    of `modelled`, the positions of the nominal tool, m, (n, 3). Raises InputError if the
+    headers have several units.
     """
     units = {columns.units.get(i, '') for i in columns.point} - {''}
     if stated_unit:
@@ -206,10 +208,11 @@ def refuse_far(table: TextTable, columns: Columns, unit: str) -> None:
 def times(table: TextTable, columns: Columns) -> FloatArray | None:
     """Times of the rows, s, (n,); None if the table has none.
 
-    A time is a number, ISO 8601, or a date and a time as programs write them (dates with points
-    have the day first), in one column or in two. Dates become seconds since 1970; numbers without
-    a unit are s, or ms, µs or ns if they are as large as times since 1970, or days of a
-    spreadsheet. Raises InputError for text that is no time.
+    A time is a number, ISO 8601, or a date and a time as programs write them (dates with
+    points have the day first), in one column or in two. Dates become seconds since 1970.
+    Numbers without a unit are s, or ms, µs or ns if they are as large as times since 1970, or
+    days of a spreadsheet, or, if all are below 1, shares of a day. Raises InputError for text
+    that is no time.
     """
     column = columns.first_of_kind('time')
     clock, date = columns.first_of_kind('clock'), columns.first_of_kind('date')
@@ -244,7 +247,7 @@ def times(table: TextTable, columns: Columns) -> FloatArray | None:
 
 
 def _time(text: str, decimal: str, day_first: bool) -> float | None:
-    """Time of a cell, s, or the number that it is; None if the cell is no time.
+    """Time of a cell, s; if it is a number, that number; None if the cell is no time.
 
     Dates count from 1970 in local time, unless a zone is stated; a time of day is on 1 January
     2000.
@@ -281,7 +284,7 @@ def _time(text: str, decimal: str, day_first: bool) -> float | None:
 
 
 def _in_english(text: str) -> str:
-    """A time with English names of months, without days of the week, and with colons."""
+    """Text of a date and time with English months, without days of the week, and with colons."""
     text = _WORD.sub(lambda word: _MONTHS.get(word[1].casefold(), word[0]), text)
     text = re.sub(r'[年月]', '-', text).replace('日', ' ').replace('_', ' ')
     text = re.sub(r'([AaPp])\. ?([Mm])\.', r'\1\2', text)

@@ -23,13 +23,16 @@ _HAND_BEHIND = 5
 
 
 def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
-    """Return the likely base link of the arm.
+    """Return the likely base link of the arm: the robot's root, with two exceptions.
 
-    The root, or, if the root is a world frame, the link fixed to it. If a prismatic joint (a rail,
-    a lift) carries an arm of five or more revolute joints, the link that this joint moves, unless
-    `names` has the prismatic joint.
+    If the chain with the most joints (with ``names``: most of these) hangs on a joint that is
+    not the arm's (a rail or a lift with five or more revolute joints behind it, or a floating
+    or planar joint): the link behind that joint, or, if names of links from there to the arm's
+    first joint contain 'base', the shortest of these. If the root is a world frame (`_WORLD`)
+    with one link fixed to it: that link.
 
-    ``names``: joints that are known to be the arm's, as in `likely_tips`.
+    ``names``: joints that are known to be the arm's, as in `likely_tips`; a prismatic joint
+    among them is part of the arm, any other is not.
     """
     sliders = _sliders(model, names, carrying=False)
     arms = {
@@ -73,7 +76,7 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     Raises
     ------
     InputError
-        If no joint moves behind the base, or there are several arms.
+        If the base link is missing, no joint moves behind it, or there are several arms.
     """
     if base_link not in model.links:
         raise InputError(f"URDF: there is no link '{base_link}'; it has {', '.join(model.links)}")
@@ -202,11 +205,12 @@ def _arm(
     sliders: Container[str] = (),
     names: Container[str] = (),
 ) -> tuple[str, list[UrdfJoint]] | None:
-    """Return the first link and the joints of the arm that carries a link; None within a hand.
+    """Return the base link of the arm that carries a link, and its moving joints, base to tip.
 
-    The arm starts at `base_link`, at the root, or behind a joint that is neither revolute nor one
-    of the `sliders`. A link behind five joints of which another moving joint branches off is in a
-    hand, unless `names` has the joint.
+    From the link towards the root, up to `base_link` or a joint that is neither fixed, revolute,
+    continuous nor one of the `sliders`. None if a mimic joint or a jaw (`_is_jaw`) is on the way,
+    or another moving joint branches off behind the first five (a hand), unless `names` has the
+    joint.
     """
     joints: list[UrdfJoint] = []
     while link != base_link and (joint := model.parent_joint.get(link)) is not None:

@@ -37,7 +37,7 @@ _AROUND_A_BALL = np.concatenate(
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A convex set: the hull of `points`, grown by a disc across z and by a ball."""
+    """Convex shape: the hull of `points`, grown by a disc across z and by a ball."""
 
     kind: str  # ``box``, ``cylinder``, ``sphere``, ``capsule`` or ``hull``
     points: FloatArray  # m, (n, 3)
@@ -59,9 +59,10 @@ class Shape:
 
     @cached_property
     def capsule(self) -> tuple[FloatArray, FloatArray, float]:
-        """Ends (m, (3,) each) and radius (m) of a small capsule around the shape.
+        """Ends (m, (3,) each) and radius (m) of a capsule that encloses the shape, in its frame.
 
-        Of a box or hull that of least volume along six axes; the ends of a sphere are one point.
+        The ends are those of the capsule's axis, equal for a sphere. Of a box or hull it is the
+        capsule of least volume along six axes: x, y, z and the principal axes of the points.
         """
         if self.kind in ('sphere', 'capsule', 'cylinder'):
             return self.points[0], self.points[-1], self.ball + self.disc
@@ -113,7 +114,10 @@ def cylinder(radius_m: float, length_m: float) -> Shape:
 
 
 def sphere(radius_m: float) -> Shape:
-    """Return a sphere centred at the origin."""
+    """Return a sphere centred at the origin.
+
+    Raises InputError if the radius, m, is not positive and finite.
+    """
     (radius,) = _positive('sphere', (radius_m,), 1)
     return Shape('sphere', np.zeros((1, 3)), ball=radius)
 
@@ -160,7 +164,7 @@ def _positive(kind: str, values: ArrayLike, count: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A shape fixed to a link of the arm, or to the base."""
+    """Convex body for collision checks: a shape fixed to a link of the arm, or to the base."""
 
     name: str
     link: int  # 0 for the base, i for the link after joint i (1-based)

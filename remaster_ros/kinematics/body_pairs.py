@@ -31,7 +31,7 @@ _MOST = 0.95
 
 @dataclass(frozen=True)
 class Shortfall:
-    """A pair of bodies nearer to each other than its clearance."""
+    """Pair of bodies that is nearer to each other than its clearance at a configuration."""
 
     index: int  # Of the configuration
     pair: int
@@ -41,7 +41,7 @@ class Shortfall:
 
 @dataclass(frozen=True)
 class Placed:
-    """The bodies at n configurations."""
+    """Poses of base and links, and ends of the bodies' capsules, at n configurations."""
 
     frames: FloatArray  # Of base and links, (n, k + 1, 4, 4)
     # Ends of the bodies' capsules in R, m, (n, B, 3)
@@ -50,7 +50,7 @@ class Placed:
 
 
 class BodyPairs:
-    """All pairs among the arm, its tool and markers, the obstacles and the floor.
+    """Pairs of bodies to check for collisions: arm, tool, markers, obstacles and floor.
 
     ``bodies``: all, by link; ``floor_z``: height of the floor in R, m; None for no floor;
     ``margin``: fixed part of the clearance, m; ``unknown_offset``: bound of a joint's unknown
@@ -86,7 +86,11 @@ class BodyPairs:
         self._apply_rule()
 
     def _possible_pairs(self) -> tuple[IntArray, IntArray]:
-        """Return inner and outer bodies of all pairs that a joint can move, (P,) each."""
+        """Return body indices (inner, outer), (P,) each, of all pairs that a joint can move.
+
+        Inner is nearer to the base, or -1 for the floor. Left out are two links of the arm next to
+        each other, or with joints between them that all act along one line (`_on_one_line`).
+        """
         inner, outer = [], []
         for j, second in enumerate(self.bodies):
             if second.link == 0:
@@ -103,9 +107,10 @@ class BodyPairs:
         return np.array(inner, dtype=np.int64), np.array(outer, dtype=np.int64)
 
     def _on_one_line(self, joints: Sequence[int]) -> bool:
-        """Whether the joints between two links all move along and about one line.
+        """Whether the joints between two links all move along and about one common line.
 
-        True of a single joint; False of several without a slide. ``joints``: indices from 0.
+        True for fewer than two joints; False for several of which none is prismatic.
+        ``joints``: indices from 0.
         """
         if len(joints) < 2:
             return True
@@ -120,10 +125,10 @@ class BodyPairs:
     def _set_pairs(
         self, inner: IntArray, outer: IntArray, contact_only: BoolArray | None = None
     ) -> None:
-        """Set the pairs and the constants of each of them: levers, clearances, kinds.
+        """Set the attributes of the pairs (see the class): bodies, levers, largest clearances.
 
-        ``inner, outer``: indices of the bodies, -1 for the floor, (P,); ``contact_only``: None for
-        none.
+        ``inner, outer``: indices of the bodies of each pair, inner -1 for the floor, (P,);
+        ``contact_only``: mask, (P,), None for no such pair.
         """
         self.inner, self.outer = inner, outer
         self.is_floor = inner < 0
@@ -157,10 +162,11 @@ class BodyPairs:
         )
 
     def _apply_rule(self) -> None:
-        """Remove pairs that overlap by construction; check near ones for contact only.
+        """Remove pairs that overlap by construction; check those always near for contact only.
 
-        Over `_SAMPLES` random configurations: in `_MOST` of them for two bodies of the arm, in all
-        for floor and obstacles. Each such pair gets a line in `left_out`.
+        Over `_SAMPLES` random configurations: removed is a pair that overlaps in 95 % of them
+        (`_MOST`), with floor or obstacle in all. Checked for contact only is one that is nearer
+        than its clearance plus `RESERVE_M` as often. Each such pair gets a line in `left_out`.
         """
         low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
@@ -184,7 +190,7 @@ class BodyPairs:
     def category(self, pair: int) -> str:
         """Return the category of a collision of a pair: with itself, the floor or an obstacle.
 
-        One of `SELF_COLLISION`, `FLOOR`, `OBSTACLE`; ``pair``: index, as everywhere here.
+        One of `SELF_COLLISION`, `FLOOR`, `OBSTACLE`; ``pair``: index of the pair, from 0.
         """
         if self.is_floor[pair]:
             return FLOOR
@@ -192,7 +198,10 @@ class BodyPairs:
         return OBSTACLE if inner.role == 'obstacle' else SELF_COLLISION
 
     def names(self, pair: int) -> tuple[str, str]:
-        """Return the names of the inner and the outer body of a pair."""
+        """Return the names of the inner and the outer body of a pair, given by its index.
+
+        The inner name is 'the floor' for a pair with the floor.
+        """
         inner = 'the floor' if self.is_floor[pair] else self.bodies[self.inner[pair]].name
         return inner, self.bodies[self.outer[pair]].name
 
@@ -217,7 +226,7 @@ class BodyPairs:
         return reach
 
     def place(self, q: FloatArray) -> Placed:
-        """Return the bodies at configurations (n, k), rad or m; limits are not checked."""
+        """Return the poses of the bodies at configurations (n, k), rad or m, limits unchecked."""
         frames = np.empty((len(q), len(self.chain) + 1, 4, 4))
         frames[:, 0] = np.eye(4)
         frames[:, 1:] = self.chain.frames(q)
@@ -251,9 +260,10 @@ class BodyPairs:
         return bounds
 
     def kept(self, placed: Placed, rows: IntArray, pairs: IntArray) -> FloatArray:
-        """Return the clearances of pairs, m, (c,): margin + unknown_offset · √(Σ lever²).
+        """Return the clearance of each of c pairs at a configuration, m, (c,).
 
-        At most `most_kept`. ``rows``, ``pairs``: indices of configuration and pair of each, (c,).
+        It is margin + unknown_offset · √(Σ lever²) over the joints between the two bodies, at most
+        `most_kept`. ``rows``, ``pairs``: indices of the configuration and of the pair, (c,) each.
         """
         frames = placed.frames[rows, 1:]
         axes = self.chain.axes_in_base(frames)
@@ -276,14 +286,17 @@ class BodyPairs:
         return np.minimum(kept, self.most_kept[pairs])
 
     def on_top(self, extra: float) -> FloatArray:
-        """Return the addition to the clearance of each pair, m, (P,): 0 for contact only.
+        """Return the addition to the clearance of each pair, m, (P,).
 
-        ``extra``: the addition for all other pairs, m.
+        ``extra``: the addition, m; 0 for pairs that are checked for contact only.
         """
         return np.where(self.contact_only, 0.0, extra)
 
     def measure(self, placed: Placed, row: int, pair: int) -> float:
-        """Return the distance of a pair at configuration `row`, m, negative if they overlap."""
+        """Return the distance of two bodies at configuration `row`, m, negative if they overlap.
+
+        ``row``, ``pair``: indices; not for a pair with the floor.
+        """
         inner, outer = int(self.inner[pair]), int(self.outer[pair])
         frames = placed.frames[row]
         return self._convex.distance(
@@ -293,9 +306,11 @@ class BodyPairs:
     def measure_cheap(
         self, placed: Placed, rows: IntArray, pairs: IntArray, bounds: FloatArray
     ) -> BoolArray:
-        """Write distances that need no coal into `bounds` (n, P); return for which pairs, (c,).
+        """Write exact distances that need no call of coal into `bounds`; return their mask, (c,).
 
-        Those are pairs with the floor, and pairs whose bounds are exact already.
+        ``rows``, ``pairs``: indices of the configuration and of the pair, (c,) each; ``bounds``:
+        of `lower_bounds`, m, (n, P), changed in place. The mask is True for pairs with the floor,
+        and for pairs of spheres and capsules, whose bounds are exact already.
         """
         on_floor = self.is_floor[pairs]
         for pair in np.unique(pairs[on_floor]):
@@ -311,11 +326,12 @@ class BodyPairs:
     def candidates(
         self, placed: Placed, bounds: FloatArray, is_open: BoolArray | None, extra: float
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
-        """Return possible violations: rows, pairs, their clearances, and whether each is certain.
+        """Return possible violations: configuration, pair, clearance, whether certain, (c,) each.
 
-        Distances that need no coal are computed at once and written into `bounds`, and only
-        violations of these are returned, as certain. ``bounds``: of `lower_bounds`, (n, P);
-        ``is_open``: pairs to consider, (n, P), None for all; ``extra``: added to the clearance, m.
+        Configurations and pairs are indices. Distances that need no coal are computed at once
+        and written into `bounds`, and only violations of these are returned, as certain.
+        ``bounds``: of `lower_bounds`, (n, P); ``is_open``: mask of the pairs to consider, (n,
+        P), None for all; ``extra``: added to the clearance, m.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top
@@ -332,10 +348,11 @@ class BodyPairs:
     def examine(
         self, placed: Placed, extra: float, *, first: bool = False, one: bool = False
     ) -> tuple[list[Shortfall], FloatArray]:
-        """Return the violations, and the distances or lower bounds of all pairs, m, (n, P).
+        """Return the pairs nearer than their clearance, and a distance of each pair, m, (n, P).
 
-        ``extra``: added to the clearance, m. With `first`, one violation of each configuration at
-        most, not always the worst; with `one`, one in all.
+        The distances are exact for the returned pairs, else exact or lower bounds. ``placed``: the
+        bodies at n configurations; ``extra``: added to the clearance, m; ``first``: return at most
+        one pair of each configuration, not always the worst; ``one``: return at most one in all.
         """
         bounds = self.lower_bounds(placed)
         rows, pairs, kept, decided = self.candidates(placed, bounds, None, extra)

@@ -61,10 +61,12 @@ def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) ->
     """Return the given bodies, with a capsule along each link that has no body.
 
     A capsule goes from the link's joint to the next one, or to the tip. The guide of a prismatic
-    joint is added as well: if the base has no body, a rail along the whole travel of a first
-    joint; else a rod that moves with the joint's link, as long as its travel.
+    joint is added as well: of a first joint a rail along its whole travel, if the base has no
+    body; of a later joint a rod that moves with its link, as long as its travel, if the link has
+    no body.
 
-    ``given``: known bodies of the arm, its tool and markers; ``link_radius``: of the capsules, m.
+    ``given``: known bodies of the arm, its tool and markers, of which only those with the role
+    'link' count as a link's body; ``link_radius``: of the capsules, m.
     """
     covered = {body.link for body in given if body.role == 'link'}
     bodies = list(given)
@@ -88,7 +90,7 @@ def arm_bodies(chain: SerialChain, given: Sequence[Body], link_radius: float) ->
 
 
 class CollisionModel:
-    """The arm with its tool and markers, the obstacles and the floor.
+    """Collision checks, with clearance, of an arm with tool, markers, obstacles and floor.
 
     Parameters
     ----------
@@ -184,7 +186,8 @@ class CollisionModel:
 
         Pairs whose clearance is violated at the start never come nearer on the way (by more than
         0.1 mm between two checks), all others keep their clearance, the end is free (if
-        `ends_free`), and no joint leaves its limits. ``waypoints``: rad, (n, k), n >= 1.
+        `ends_free`), and no joint goes beyond its limits, or further beyond than at the start.
+        ``waypoints``: rad or m, (n, k), n >= 1.
         """
         q = np.asarray(waypoints, dtype=float)
         if not np.all(np.isfinite(q)):
@@ -213,7 +216,7 @@ class CollisionModel:
         return ''
 
     def travel(self, start: FloatArray, end: FloatArray) -> float:
-        """Upper bound on the motion of any body relative to another between configurations, m.
+        """Upper bound on the relative motion of any pair of bodies between configurations, m.
 
         ``start``, ``end``: rad or m, (k,). 0 without pairs.
         """
@@ -255,7 +258,10 @@ class CollisionModel:
         return self.reasons(q, extra) == ''
 
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
-        """Return whether a link stands between marker and sensor; see `LinkCapsules.hides`."""
+        """Return whether a link of the arm hides a marker from a sensor, (...).
+
+        Arguments as of `LinkCapsules.hides`.
+        """
         return self._sight.hides(q, marker_T, sensor_R)
 
     @cached_property
@@ -289,9 +295,9 @@ class CollisionModel:
         return f'{outer} {1e3 * short.distance:.0f} mm from {inner}, {kept}'
 
     def _limit_trouble(self, q: FloatArray) -> str:
-        """Return in words the joint furthest outside its limits, over waypoints (n, k); or ''.
+        """Return as text the joint furthest outside its limits over waypoints (n, k), and where.
 
-        A tolerance of `_LIMIT_TOLERANCE` is accepted.
+        '' if none is outside by more than `_LIMIT_TOLERANCE`.
         """
         chain = self.chain
         over = np.maximum(chain.lower - q, q - chain.upper)
@@ -306,11 +312,11 @@ class CollisionModel:
         return f'{chain.joint_names[joint]} at {at}, its limits are {low.split()[0]} to {high}'
 
     def _sweep(self, start: FloatArray, end: FloatArray, extra: float) -> Shortfall | None:
-        """Return a violation of the clearance on a straight path; None if it is free.
+        """Return a pair nearer than its clearance on a straight path; None if there is none.
 
         Checked in steps in which no body moves by more than `STEP_M` relative to another.
         ``start``, ``end``: rad or m, (k,), both checked as well; ``extra``: added to the
-        clearance, m. The violation is any, not the first on the path.
+        clearance, m. The pair is any, not the first on the path; its `index` has no meaning.
         """
         travel = self._pairs.levers @ np.abs(end - start)
         steps = max(1, ceil(float(travel.max(initial=0.0)) / STEP_M))
@@ -344,11 +350,13 @@ class CollisionModel:
         per_step: FloatArray,
         extra: float,
     ) -> Shortfall | None:
-        """Return a violation at some steps of a path q (n, k); None if there is none.
+        """Return a pair nearer than its clearance at some steps of a path q (n, k), or None.
 
-        ``inside``: indices of the steps, (m,); ``is_open``: pairs to check at each, (m, P);
-        ``per_step``: upper bound on the change of each pair's distance in one step, m, (P,).
-        ``extra``: added to the clearance, m.
+        Any one, not the first or worst; its `index` counts within `inside`. A pair far enough away
+        at a step is not measured again until it could have come near. Nothing is changed in place.
+        ``inside``: indices of steps of q, ascending, (m,); ``is_open``: pairs to check at each,
+        (m, P); ``per_step``: upper bound on the change of each pair's distance in a step, m, (P,);
+        ``extra``: added to the clearance of each pair that is not for contact only, m.
         """
         placed = self._pairs.place(q[inside])
         bounds = self._pairs.lower_bounds(placed)

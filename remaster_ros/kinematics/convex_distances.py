@@ -25,7 +25,10 @@ class ConvexDistances:
 
     @cached_property
     def _coal(self) -> Any:
-        """The module coal, or hppfcl, its name before version 3, with coal's names."""
+        """The module coal, or hppfcl (its name before version 3), given coal's names.
+
+        Raises ImportError if neither is installed.
+        """
         # Imported here: commands that move nothing need not load it.
         try:
             import coal

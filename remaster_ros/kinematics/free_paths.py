@@ -73,9 +73,10 @@ def free_path(
 
 
 def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) -> bool:
-    """Whether the straight path is free; with the planner's reserve if the start has it too.
+    """Whether a straight path in joint space is free of collisions and within the joint limits.
 
-    Joint limits count. ``start, end``: rad or m, (k,).
+    The planner's reserve (`RESERVE_M`) is added to the clearance if the start is free with it.
+    ``start, end``: rad or m, (k,).
     """
     extra = RESERVE_M if model.free_mask(start[None], RESERVE_M)[0] else 0.0
     return not model.path_trouble(np.array([start, end]), extra)
@@ -84,10 +85,11 @@ def is_straight_free(model: CollisionModel, start: FloatArray, end: FloatArray) 
 def _intermediates(
     model: CollisionModel, start: FloatArray, end: FloatArray, hints: Sequence[FloatArray]
 ) -> Iterator[list[FloatArray]]:
-    """Yield likely intermediate waypoints, the likeliest first.
+    """Yield lists of one or two waypoints to try between start and end, the likeliest first.
 
-    Each hint alone; start and end moved towards the middle by 0.35, 0.7 and 1; then the corners at
-    which the first joint moves before or after the others.
+    Each of the `hints` alone; start and end, each moved by 0.35, 0.7 and 1 of the way to zero
+    (clipped to the limits) in all joints but the first; then the two corners of the path on which
+    the other joints move before the first, or after it.
     """
     for hint in hints:
         yield [np.asarray(hint, dtype=float)]
@@ -106,7 +108,7 @@ def _intermediates(
 
 
 class _Node(NamedTuple):
-    """A configuration of a tree, and the node from which it was reached."""
+    """Configuration in a search tree, and the node from which it was reached (None: the root)."""
 
     q: FloatArray  # rad, (k,)
     parent: _Node | None
@@ -122,7 +124,7 @@ class _Node(NamedTuple):
 
 
 class _Search:
-    """RRT-connect: grows two trees towards each other, and counts the effort."""
+    """RRT-connect search: grows two trees towards each other, up to a number of segments."""
 
     def __init__(
         self, model: CollisionModel, start: FloatArray, end: FloatArray, most: int
@@ -289,9 +291,10 @@ def way_out(
 
 
 def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
-    """Return an escape path (n, k) with fewer waypoints: the arm comes to rest at each of them.
+    """Return an escape path (m, k) through as few of the waypoints of one, (n, k), as found.
 
-    A subset of its waypoints, ends included; each line is an escape again.
+    The ends are kept, and each straight line between waypoints is an escape again. The arm comes
+    to rest at each waypoint.
     """
     kept, corner, last = [way[0]], 0, len(way) - 1
     while corner < last:

@@ -19,7 +19,7 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class MovingLinks:
-    """Motion of the link after each of k joints, in R, along n configurations."""
+    """Velocities and accelerations of an arm's k links in the base R, at n configurations."""
 
     chain: SerialChain
     frames: FloatArray  # T_R_link, (n, k, 4, 4)
@@ -31,7 +31,7 @@ class MovingLinks:
     def of(
         cls, chain: SerialChain, q: FloatArray, velocity: FloatArray, acceleration: FloatArray
     ) -> MovingLinks:
-        """Motion at joint positions, velocities and accelerations, (n, k) each.
+        """Motion of the links by joint positions, velocities and accelerations, (n, k) each.
 
         rad, rad/s and rad/s²; m, m/s and m/s² for joints that slide.
         """

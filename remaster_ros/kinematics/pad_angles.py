@@ -24,7 +24,7 @@ from remaster_ros.types import Controller, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class PadAngles:
-    """Linear map between the k angles on the pad and those of the URDF, rad."""
+    """Linear map between the k joint angles on a teach pendant and those of the URDF, rad."""
 
     # S (I + K), (k, k), and its inverse, both of whole numbers
     matrix: FloatArray
@@ -37,8 +37,9 @@ class PadAngles:
     def of(cls, controller: Controller | None, joint_names: Sequence[str]) -> PadAngles:
         """Return the map of a controller; joints that it does not name have equal angles.
 
-        None for the identity. ``joint_names``: of the URDF's k joints. Raises ValueError if a
-        coupling names another joint, IndexError if couplings go in a circle (`coupled_in_circle`).
+        ``controller``: None gives the identity; ``joint_names``: of the URDF's k joints. Raises
+        ValueError if a coupling names another joint, IndexError if couplings go in a circle
+        (`coupled_in_circle`).
         """
         k = len(joint_names)
         matrix, zero = np.eye(k), np.zeros(k)
@@ -68,13 +69,14 @@ class PadAngles:
         return self.offsets_on_pad(q - self.zero)
 
     def offsets_on_pad(self, offsets: FloatArray) -> FloatArray:
-        """Convert zero-offsets of URDF joints to additions to pad angles, rad, (..., k)."""
+        """Convert zero-offsets of URDF joints to what is added to pad angles, rad, (..., k)."""
         return offsets @ self.from_urdf.T
 
     def coupled(self, joint: int) -> tuple[int, ...]:
         """Return the indices of the joints whose pad angles are added to that of a joint.
 
-        From 0, ascending; () if there are none.
+        ``joint``: its index. All indices are from 0, the returned ones ascending; () if there
+        are none.
         """
         return tuple(j for j in np.flatnonzero(self.matrix[joint]).tolist() if j != joint)
 
@@ -97,9 +99,9 @@ def pad_in_words(controller: Controller) -> list[str]:
 
 
 def coupled_in_circle(coupling: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a joint whose angle depends on itself through couplings; '' if there is none.
+    """Return the name of a joint whose angle depends on itself through couplings; '' if none does.
 
-    ``coupling``: joint -> the joints whose pad angles are added to its angle.
+    ``coupling``: name of a joint -> the joints whose pad angles are added to its angle.
     """
     for joint in coupling:
         reached, pending = set(), list(coupling[joint])

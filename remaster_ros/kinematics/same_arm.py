@@ -28,8 +28,8 @@ def difference(chain: SerialChain, description: str) -> str:
 
     Axes are compared with all joints at zero, within `PLACE_M` and `TURN_RAD`; the position of the
     first joint if the description has the arm's base link, the tip if it has the arm's tip link.
-    Limits of the description may be wider than the arm's. Text that is no URDF is a contradiction
-    too. ``chain``: the arm; ``description``: URDF text.
+    Position and velocity limits of the description may be wider than the arm's. Text that is no
+    URDF is a contradiction too. ``chain``: the arm; ``description``: URDF text.
     """
     read = _read(chain, description)
     if isinstance(read, str):
@@ -78,9 +78,9 @@ def axes_apart(chain: SerialChain, description: str) -> float:
 
 
 def _read(chain: SerialChain, description: str) -> tuple[SerialChain, bool, bool] | str:
-    """Return a description's arm, whether it has base and tip link; or why it is another.
+    """Return a description's arm, and whether it has the base and the tip link of the chain.
 
-    The reason, as text, if it is invalid, lacks a joint, or has the joints in another order.
+    Or a text with the reason if it is invalid, lacks a joint, or has the joints in another order.
     """
     try:
         model = parse_urdf(description)
@@ -117,7 +117,10 @@ def _tip(chain: SerialChain, from_base: bool) -> FloatArray:
 
 
 def _from(chain: SerialChain, base: bool) -> FloatArray:
-    """Return the transform from the base frame to the reference frame of `_axes`, (4, 4)."""
+    """Return the transform of points from the base frame to the frame of `_axes`, (4, 4).
+
+    The identity if ``base``; else that frame is the first joint's, at zero.
+    """
     return np.eye(4) if base else inverse(chain.T_fixed[0])
 
 

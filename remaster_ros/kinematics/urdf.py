@@ -82,10 +82,10 @@ class UrdfModel:
         return [name for name in self.links if name not in parents]
 
     def carrier(self, link: str, moving: Container[str]) -> tuple[str, FloatArray]:
-        """Return the nearest of the `moving` links on the way to the root, and the pose to it.
+        """Return the first link in `moving` on the way from a link to the root, and a pose.
 
-        The link itself counts; the root if there is no other. The pose is T_carrier_link (4, 4)
-        with all joints between the two at zero.
+        The link itself counts; the root if there is no other. The pose is T_carrier_link (4, 4),
+        that of the given link in the returned one, with all joints between the two at zero.
         """
         T = np.eye(4)
         while link not in moving and link in self.parent_joint:
@@ -100,9 +100,10 @@ def parse_urdf(text: str) -> UrdfModel:
     Raises
     ------
     InputError
-        If the XML is malformed or declares a DOCTYPE or entities, a joint names a missing link,
-        two links or joints share a name, a link has two parents, links form a loop, or a number
-        is malformed.
+        If the XML is malformed or declares a DOCTYPE or entities, it is xacro, a joint names a
+        missing link, two links or joints share a name, a link has two parents, links form a loop
+        or no single tree, a number is malformed, or there are too many links (`MOST_LINKS`), or
+        too many in one chain (`MOST_DEPTH`).
     """
     # The keyword is case-sensitive in XML, so text without it cannot declare an entity.
     if '<!DOCTYPE' in text or '<!ENTITY' in text:

@@ -29,7 +29,7 @@ None leaves that shape out."""
 
 @dataclass(frozen=True, eq=False)
 class LinkShape:
-    """One <collision> element of a link."""
+    """Shape and pose of one <collision> element of a link."""
 
     link: str  # The URDF's link
     T_link_shape: FloatArray  # Pose of the shape in the link's frame, (4, 4)
@@ -38,7 +38,7 @@ class LinkShape:
 
 @dataclass(frozen=True, eq=False)
 class Visual:
-    """One ``<visual>`` element of a link of the arm."""
+    """Shape or mesh, pose and colour of one ``<visual>`` element of a link of the arm."""
 
     link_name: str  # The URDF's link
     link: int  # 0 for the base, i for the link after joint i

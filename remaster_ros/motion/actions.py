@@ -16,7 +16,10 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True)
 class CheckPath:
-    """Find out whether the way to a target is free; answer with `ArmSupervisor.path_found`."""
+    """Action: check whether the arm's way to a target is free of collisions.
+
+    The answer goes to `ArmSupervisor.path_found`.
+    """
 
     number: int  # Names the request
     # rad or m, (k,)
@@ -39,7 +42,7 @@ class PathAnswer:
 
 @dataclass(frozen=True)
 class Drive:
-    """Publish this move, at once: it was decided at `wall_s`."""
+    """Action: publish this move at once, as it was decided for the time `wall_s`."""
 
     solution: int
     admitted: Admitted
@@ -49,7 +52,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Renew:
-    """Publish the next piece of the move under way, at once: it was decided at `wall_s`."""
+    """Action: publish the next piece of the move under way at once; it was decided at `wall_s`."""
 
     admitted: Admitted
     wall_s: float
@@ -58,7 +61,7 @@ class Renew:
 
 @dataclass(frozen=True)
 class Stop:
-    """Publish this stop, at once: it is for where the arm is at `wall_s`."""
+    """Action: publish this stop at once, as it is for where the arm is at `wall_s`."""
 
     admitted: Admitted
     reason: str
@@ -68,7 +71,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Settled:
-    """The arm stands still at a configuration."""
+    """Action: report that the arm stands still at a configuration."""
 
     solution: int
     stamp_s: float  # Stamp of the report that completed the settling, s
@@ -80,7 +83,7 @@ class Settled:
 
 @dataclass(frozen=True)
 class Failed:
-    """A configuration is given up."""
+    """Action: report that a configuration is given up."""
 
     solution: int
     reason: str
@@ -88,7 +91,7 @@ class Failed:
 
 @dataclass(frozen=True)
 class Halted:
-    """The arm stays where it is until a person clears the halt."""
+    """Action: report that the arm is halted until a person clears the halt."""
 
     reason: str
 
@@ -98,7 +101,7 @@ Action = CheckPath | Drive | Renew | Stop | Settled | Failed | Halted
 
 @dataclass(frozen=True)
 class SupervisorRules:
-    """When to wait, to give up and to halt. Times in s."""
+    """Rules of the arm supervisor: when it waits, gives up or halts. Times in s."""
 
     settle: SettleRules = field(default_factory=SettleRules)  # What counts as arrived and still
     # Beyond the expected motion and the settling: not arrived (robot time)

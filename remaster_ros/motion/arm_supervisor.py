@@ -73,7 +73,7 @@ BEGINS = {PROBE: Event.PROBE, WAY_OUT: Event.LEAVE}
 
 
 class ArmSupervisor:
-    """Visit the joint solutions of a pose one by one, and stop or halt when anything is wrong.
+    """State machine that leads an arm to the solutions of a pose in turn, and stops or halts it.
 
     The actions that a method returns have to be carried out in their order.
 
@@ -94,7 +94,7 @@ class ArmSupervisor:
     Attributes
     ----------
     halted
-        Why the arm stays where it is until a person clears the halt; ''.
+        Why the arm stays where it is until a person clears the halt; '' if it is not halted.
     missed
         How often the next piece of a move came too late, so that the arm stopped on its way.
     why_missed
@@ -133,10 +133,13 @@ class ArmSupervisor:
     # What comes in
 
     def planner_is(self, state: str, wall_s: float, run: str = '') -> list[Action]:
-        """Process the planner's state at `wall_s`, s; anything but ``running`` stops the arm.
+        """Process the planner's state; return the actions of `tick`.
 
-        ``run`` identifies the run of a collection, '' if none: a new one shows that a person has
-        called /remaster/collect, and clears the counts of failures in a row.
+        Any state but ``running`` is a reason not to move, which stops an arm on its way.
+        ``run``: token of the collection run, '' if none. A run other than the last one shows
+        that a person has called /remaster/collect: the counts of failures in a row are
+        cleared, and what is known of the arm's place is doubted (`Finding.DOUBT`). ``wall_s``:
+        now, wall time, s.
         """
         if self._interlocks.planner(state, run, wall_s):
             self._failures = self._refusals = self._missed_in_a_row = 0
@@ -145,10 +148,10 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def recorder_waits(self, waiting_for: str, wall_s: float) -> list[Action]:
-        """Process a sign of life of the recorder at `wall_s`, s, which may wait on purpose.
+        """Process a sign of life of the recorder; return the actions of `tick`.
 
-        ``waiting_for``: what it waits for, which stops the arm; '' if no required sensor is
-        missing.
+        ``waiting_for``: what it waits for (a required sensor, room on the disk), a reason not
+        to move, which stops an arm on its way; '' if it waits for nothing. ``wall_s``: now, s.
         """
         why = f'waiting for {waiting_for}' if waiting_for else ''
         self._interlocks.note_alive('recorder', why, wall_s)
@@ -162,12 +165,13 @@ class ArmSupervisor:
         refused: Mapping[int, str] = NO_REFUSALS,
         shares: Mapping[int, FloatArray] = NO_SHARES,
     ) -> list[Action]:
-        """Begin to visit the solutions of a pose, rad or m, (m, k), in this order; m = 0: stop.
+        """Begin to visit the solutions of a pose, in their order; return actions.
 
-        A move under way is stopped first. ``waypoints`` has configurations on the way to a
-        solution, (n, k), by its number, from 0; ``shares`` their shares of a curve, (n,), if the
-        way is one, which begins at the first of them; ``refused`` why a solution must not be
-        commanded. ``wall_s``: now, wall time, s.
+        A move under way is stopped first; with m = 0 no solution follows. ``solutions``: rad
+        or m, (m, k). By a solution's index, from 0: ``waypoints``: configurations on the way
+        to it, (n, k); ``shares``: if the way is a curve, which begins at the first waypoint,
+        the share of the curve at each waypoint, (n,); ``refused``: why the solution must not
+        be commanded. ``wall_s``: now, wall time, s.
         """
         actions = self._stop('another pose' if len(solutions) else 'stopped', wall_s)
         actions += self._step(Event.NEW_POSE)
@@ -189,20 +193,23 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
-        """Process whether the robot's own safety circuit stops the arm; if so, halt.
+        """Process whether the robot's safety circuit stops the arm; return the actions of `tick`.
 
-        ``wall_s``: now, wall time, s.
+        If it does, they halt the arm ([] once halted), without a command. If not, an emergency
+        stop reported before is no longer in the way; a halt remains. ``wall_s``: now, wall
+        time, s.
         """
         self._interlocks.set('safety', 'the robot reports an emergency stop' if stopped else '')
         return self.tick(wall_s)
 
     def observe(self, name: str, trouble: str, wall_s: float) -> list[Action]:
-        """Process a trouble of something observed beside the joints; return actions.
+        """Process the state of something other than the joints that must be right; return actions.
 
-        ``name`` is one of `interlocks.OBSERVED`, ``trouble`` what is wrong with it; ''. Rivals
-        (other publishers of what moves the arm) always halt a collection. The others halt it if
-        they were right before; else they only hold it, because they take a while at the start.
-        ``wall_s``: now, wall time, s.
+        ``name``: one of `interlocks.OBSERVED`; ``trouble``: what is wrong with it, '' for
+        nothing. A trouble is a reason not to move. During a collection, one of 'rivals' (other
+        publishers of what moves the arm) always halts the arm, braked first if possible; one
+        of another name does if that was right before, else it only stops the arm, as some take
+        a while to become right. ``wall_s``: now, wall time, s.
         """
         halts = name == 'rivals' or self._interlocks.was_right(name)
         self._interlocks.set(name, trouble)
@@ -213,8 +220,9 @@ class ArmSupervisor:
     def report(self, report: JointReport) -> list[Action]:
         """Process a report of the joints; return actions, those of `tick` included.
 
-        A report that is not believed goes to `doubt`. After a gap of more than `rules.heartbeat_s`
-        a collection is halted; else the motion under way is judged by it.
+        A report that `JointReports.believes` refuses goes to `doubt`. By another one the move
+        or stop under way is judged; during a collection, stamps more than `rules.heartbeat_s`
+        of wall time apart halt the arm instead.
         """
         wall_s = report.wall_s
         if not self.reports.believes(report):
@@ -233,21 +241,22 @@ class ArmSupervisor:
         return actions + self.tick(wall_s)
 
     def other_joints(self, why: str, wall_s: float) -> None:
-        """Process a message on joint_states that has none of the arm's joints: a gripper's, say.
+        """Note a message on joint_states that has none of the arm's joints: a gripper's, say.
 
-        ``why``: text of `trouble` while the arm's own reports are silent and such messages come.
-        ``wall_s``: when it came, s.
+        ``why``: text of `trouble` while the arm's own reports are silent and such messages
+        come. ``wall_s``: when the message came, s.
         """
         self._others, self._others_wall = why, wall_s
 
     def doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Process a report that is not believed or not readable; if that lasts, halt a collection.
 
-        It lasts if for more than `DOUBT_S` none was believed; until then the actions are those of
-        `tick`. ``jumped``: the arm was reported at a place that it cannot have reached; if that
-        lasts, an idle arm is halted, too. If it lasts and there is nothing to halt, then unless
-        paused what is usual in the reports is learned anew. ``why``: for people;
-        ``wall_s``: when the report came, s.
+        It lasts if for more than `DOUBT_S` no report was believed; until then the actions are
+        those of `tick`. ``jumped``: the arm was reported at a place that it cannot have
+        reached; if that lasts, an idle arm is halted, too. If it lasts and there is nothing to
+        halt, then, unless the planner is paused, the last report and the usual delay of
+        reports are forgotten and learned anew. ``why``: for people; ``wall_s``: when the
+        report came, s.
         """
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
@@ -265,11 +274,14 @@ class ArmSupervisor:
         return self.tick(wall_s)
 
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
-        """Process the answer to the last `CheckPath`; an answer to an earlier one is ignored.
+        """Process the answer to the last `CheckPath`, and return actions.
 
-        With a path the move begins, unless the arm is blocked or has moved since; without one the
-        configuration is refused, or the arm halted if it stands where it must not. ``number``:
-        that of the `CheckPath`; ``wall_s``: now, wall time, s.
+        [] for an answer to an earlier one, or if none is waited for. With a path the move
+        begins, unless the arm may not move, or has moved since ([]: the path is asked for
+        again). Without one the configuration is refused; the arm is halted if it stands where
+        it must not. If only where the arm stands was asked for, no move begins, and an answer
+        without a path halts. ``number``: that of the `CheckPath`; ``wall_s``: now, wall time,
+        s.
         """
         asked, seen = self._queue.asked(number), self._seen
         if self.state is not Arm.ASKS or asked is None:
@@ -293,10 +305,11 @@ class ArmSupervisor:
     def clear_halt(self) -> str:
         """End the halt, on behalf of a person; return why that is refused, '' if it is not.
 
-        Refused during an emergency stop, and without a halt. Other reasons not to move remain, and
-        nothing moves before a person begins the collection again. If the arm is reported elsewhere
-        than the last command led, a person is told so first: the halt is ended by a second call,
-        while it is still reported there.
+        Refused during an emergency stop, and without a halt. Other reasons not to move remain,
+        and nothing moves before a person begins the collection again. If the arm is reported
+        elsewhere than the last command led, a person must have been told so before, by the
+        reason of the halt or by a first call, which is refused; the arm must still be reported
+        there.
         """
         if self._interlocks.reason('safety'):
             return self._interlocks.reason('safety')
@@ -323,10 +336,10 @@ class ArmSupervisor:
     def use_limits(
         self, limits: MotionLimits, wall_s: float, *, raised: bool = False
     ) -> list[Action]:
-        """Use other limits from now on; a move under way is stopped and commanded again.
+        """Use other limits from now on, and return actions; a move under way is stopped first.
 
-        After one that is `raised` nothing moves before a person begins the collection again.
-        ``wall_s``: now, wall time, s.
+        It is commanded again later. ``raised``: whether a limit is higher than before; then
+        nothing moves before a person calls /remaster/collect. ``wall_s``: now, wall time, s.
         """
         actions = self._stop('other limits', wall_s)
         self.gate.limits = limits
@@ -337,7 +350,8 @@ class ArmSupervisor:
     def given_up(self, why: str) -> list[Action]:
         """Halt, as the controller refuses the newest command, or does not go on with it.
 
-        ``why``: its reason. An arm that is halted already stays so, and is not judged by its stop.
+        ``why``: its reason. An arm that is halted already stays so, without an action; if it
+        was still braking, its stop is not watched any more.
         """
         # Where a stop was refused the arm is not judged by it any more.
         return self._step(Event.GIVEN_UP) if self.halted else self._halt(why, Event.GIVEN_UP)
@@ -351,10 +365,10 @@ class ArmSupervisor:
         return [] if self.halted else self._halt_braking(why, wall_s)
 
     def interrupted(self, since_wall_s: float) -> None:
-        """Process that no bridge was there since then, wall time, s.
+        """Process that no bridge was running since a time before this process was started.
 
-        Unless that was short (`resume_alone_s`) a person has to go on; see
-        `Interlocks.interrupted`.
+        If that is longer ago than `resume_alone_s`, a person has to call /remaster/collect to
+        go on with a run; see `Interlocks.interrupted`. ``since_wall_s``: wall time, s.
         """
         self._interlocks.interrupted(since_wall_s)
 
@@ -379,10 +393,10 @@ class ArmSupervisor:
         )
 
     def tick(self, wall_s: float) -> list[Action]:
-        """Check the time: stop or halt on silence, go on if nothing is in the way.
+        """Check the time; return actions that stop or halt on silence, or else go on.
 
-        ``wall_s``: now, s. An emergency stop halts, as does a silent robot during a collection;
-        another reason not to move (`blocked`) stops. [] once halted.
+        An emergency stop halts, as does a silent robot during a collection; another reason not
+        to move (`blocked`) stops. [] once halted. ``wall_s``: now, wall time, s.
         """
         self._wall = wall_s
         self._interlocks.look(wall_s)
@@ -417,17 +431,20 @@ class ArmSupervisor:
 
     @property
     def asks_for_collect(self) -> str:
-        """Why nothing moves in this run before a person calls /remaster/collect; ''."""
+        """Why nothing moves before a person calls /remaster/collect; '' if that is not needed."""
         return self._interlocks.asks_for_collect
 
     @property
     def end(self) -> FloatArray | None:
-        """End of the last command, rad or m, (k,); None until the arm is known to be there."""
+        """End of the last command, rad or m, (k,); None if it is not known.
+
+        Also None while it is doubtful whether the arm is there, until a probe has ended.
+        """
         return None if self._unsure else self._motion.led.end
 
     @property
     def next_end(self) -> FloatArray | None:
-        """End of the next piece of the move under way, rad or m, (k,); None without a move."""
+        """End of the next piece of a move that is sent in pieces, rad or m, (k,); else None."""
         return self._motion.next_end
 
     def use_stamps(self, *, kept: bool) -> None:
@@ -439,7 +456,7 @@ class ArmSupervisor:
 
     @property
     def busy(self) -> bool:
-        """Whether a move is under way, or a settled configuration waits for its answer."""
+        """Whether a move or probe is under way, or a settled configuration awaits its answer."""
         return self.state in HAS_VISIT
 
     @property
@@ -476,14 +493,19 @@ class ArmSupervisor:
 
     @property
     def _engaged(self) -> bool:
-        """Whether a collection or a stop is under way: trouble with the robot then halts it."""
+        """Whether trouble with the robot halts: a collection, a move or a stop is under way.
+
+        The collection must run with a person's consent; a settled configuration that waits for
+        its answer counts as a move.
+        """
         return self._interlocks.collecting or self.busy or self.state is Arm.BRAKES
 
     def _gap(self, report: JointReport) -> str:
-        """Return that a collection's arm was not observed for too long; ''.
+        """Reason to halt, if the arm of a collection was not observed for too long; else ''.
 
-        Too long is more than `rules.heartbeat_s` of wall time between two stamps. After a gap
-        above `max_gap_s` the arm has as much longer to arrive.
+        Too long: the stamps of this report and the last one differ by more than
+        `rules.heartbeat_s` of wall time. A gap above `max_gap_s` also adds itself to the time
+        to arrive of a move.
         """
         if self._seen is None:
             return ''
@@ -498,11 +520,11 @@ class ArmSupervisor:
     # Inside: the rest of a move
 
     def _go_on_moving(self, wall_s: float) -> list[Action]:
-        """Actions that send the next piece of a move, if one is due; [] if not.
+        """Action that sends the next piece of a move, in a list; [] if none is due or can be sent.
 
-        None is sent if the arm is not seen to follow, or the gate refuses it: the present piece
-        ends in a stop. If that stop is about to begin, the move counts as missed. ``wall_s``: now,
-        s.
+        None is sent if the arm is not seen to follow, or the gate refuses it: the piece that
+        the controller has ends in a stop. When that stop is about to begin, the move counts as
+        missed, and the stop is watched. ``wall_s``: now, s.
         """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
@@ -531,11 +553,12 @@ class ArmSupervisor:
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
-        """Actions that lead to the next move, if the arm stands; [] if it does not.
+        """Actions that lead to the next move of an arm that stands; [] if it does not.
 
-        Before a solution, in this order: halt after `MISSED_IN_A_ROW`, or if the arm is not where
-        it was led; check where it stands; the probe; an allowed way out. Solutions outside the
-        limits are refused, and the way to the next one is asked for. ``wall_s``: now, s.
+        In this order: halt after `MISSED_IN_A_ROW`, or if the arm is reported elsewhere than
+        it was led; ask whether it may stand there; begin the probe, or a way out that was
+        allowed. Then the way to the next solution is asked for; solutions outside the limits
+        are refused. ``wall_s``: now, s.
         """
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
@@ -570,8 +593,8 @@ class ArmSupervisor:
     def _drive(self, solution: int, path: FreePath, seen: Seen, wall_s: float) -> list[Action]:
         """Actions that begin a move; [] if the arm has moved since its path was checked.
 
-        ``solution``: its index, or `PROBE`, `WAY_OUT`. A move that the gate refuses is given up.
-        ``wall_s``: now, s.
+        ``solution``: its index, or `PROBE` or `WAY_OUT`. If the gate refuses the move, the
+        actions are those of `_give_up`. ``wall_s``: now, s.
         """
         # A stamp that is not of the controller's clock would lead the arm to another time.
         self._motion.keeps_stamps = self._keeps_stamps and self.reports.is_on_time
@@ -590,10 +613,11 @@ class ArmSupervisor:
         return self._step(BEGINS.get(solution, Event.MOVE), drive)
 
     def _give_up(self, solution: int, reason: str, wall_s: float) -> list[Action]:
-        """Actions after a refused move: the next solution, or a halt if it is no solution's.
+        """Actions after a move that is refused: those of `_refuse` and `tick`, or a halt.
 
-        ``solution``: its index; negative for a probe, a way out, or the check of where it stands.
-        ``reason``: for people; ``wall_s``: now, s.
+        A halt if it is no move to a solution. ``solution``: its index; negative for a probe, a
+        way out, or the check of where the arm stands. ``reason``: for people; ``wall_s``: now,
+        s.
         """
         if solution < 0:
             return self._halt(reason)
@@ -634,11 +658,11 @@ class ArmSupervisor:
         return self._fail(visit.solution, why) if outcome == 'failed' and visit is not None else []
 
     def _fail(self, solution: int, reason: str) -> list[Action]:
-        """Actions after a configuration was not reached; the queue goes to the next one.
+        """Actions after a configuration was not reached, or not answered, in time: `Failed`.
 
-        ``solution``: its index. `rules.failures_in_a_row` of them halt; one that has settled, and
-        was not answered in time, does not count. The arm stands, so that no stop is needed.
-        ``reason``: for people.
+        The next configuration follows. `rules.failures_in_a_row` that were not reached halt;
+        one that has settled does not count. Its move is over by then, so that no stop is
+        commanded. ``solution``: its index; ``reason``: for people.
         """
         if self.state is Arm.MOVES:
             self._failures += 1
@@ -648,9 +672,9 @@ class ArmSupervisor:
         return self._step(Event.FAILED, Failed(solution, reason))
 
     def _halt(self, reason: str, event: Event = Event.HALT) -> list[Action]:
-        """Actions of a halt; the reason of an earlier halt remains.
+        """Actions of a halt without a stop; `halted` keeps the reason of an earlier halt.
 
-        No stop is commanded; `event` is looked up in `states.ARM`.
+        ``event``: why, for the table `states.ARM`.
         """
         # Why it was halted first is what a person has to see to.
         self.halted = self.halted or reason
@@ -672,10 +696,10 @@ class ArmSupervisor:
         return self._halt(reason)
 
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
-        """Stop an arm that is on its way; the configuration is commanded again later.
+        """Actions that stop an arm on its way; the configuration is commanded again later.
 
-        [] if it is on no way, or ends by itself. It is halted if its place on the path is unknown.
-        ``reason``: for people; ``wall_s``: now, s.
+        [] if it is on no way, or ends by itself. A halt without a command if its place on the
+        path is unknown. ``reason``: for people; ``wall_s``: now, s.
         """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
@@ -689,9 +713,10 @@ class ArmSupervisor:
         return self._step(Event.STOP, stop)
 
     def _step(self, event: Event, *actions: Action) -> list[Action]:
-        """Enter the state that `states.ARM` has for an event, and return its actions.
+        """Enter the state that `states.ARM` has for an event; return the given actions.
 
-        What is not in the table is a fault of this program: nothing is commanded, and it halts.
+        If the table has no row for the event, or other types of actions, that is a fault of
+        this program: the commands among them are taken back, and a halt is returned alone.
         """
         state = self.state
         then = ARM[state].get(event)

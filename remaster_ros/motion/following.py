@@ -54,7 +54,7 @@ STOPPED_ON_ITS_WAY = 'the robot stopped on its way: an emergency or protective s
 
 @dataclass(frozen=True)
 class Seen:
-    """The last report that was believed."""
+    """State of the arm after the last report that was believed: positions, times, standstill."""
 
     q: FloatArray  # Joint positions, rad or m, (k,)
     # Its stamp, wall time and robot time, s
@@ -118,12 +118,12 @@ class Seen:
 
 
 class Following:
-    """Comparison of the arm's reports with the trajectory that it was sent.
+    """Comparison of the arm's reports with the trajectory that it was sent along.
 
     ``trajectory``: where it was sent; ``sent, sent_wall``: when, robot time and wall time, s;
-    ``rules``: how far it may lag and how long a command may take to be seen.
-    Attributes: ``sent``: when it was, robot time, s; ``reacted``: whether the arm has left its
-    start, or goes too short a way for that to be seen.
+    ``rules``: how far it may lag and how long a command may take to be seen. Attributes:
+    ``sent``: when the trajectory began, robot time, s, as shifted by `set_back`; ``reacted``:
+    whether the arm has left its start, or goes too short a way for that to be seen.
     """
 
     def __init__(
@@ -144,7 +144,10 @@ class Following:
         return time - self.sent
 
     def set_back(self, by_s: float) -> None:
-        """Begin all that follows later by `by_s`, s, as the arm rests before its next line."""
+        """Shift the rest of the trajectory later by `by_s`, s; negative for earlier.
+
+        The arm rests before the next line of the trajectory.
+        """
         self.sent += by_s
         self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
 
@@ -185,11 +188,14 @@ class Following:
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
         """Return why the latest reports do not show the arm going on along its path, or ''.
 
-        They do if they come (last one at most `JUST_S` old) and the arm is within `ON_PATH_RAD` of
-        where it should be, or lags without its lag growing by `SLOWED_SHARE` of the time. For a
-        stop it is enough to know where the arm may be (`lost`); what leads it on is for one that
-        moves: a controller may join it to an arm that has been stopped since by a jump.
-        ``wall_s``: now, s; ``rate``: robot time per wall time.
+        '' if reports come (the last at most `JUST_S` old, compared over some `SLOWED_S` to
+        `SLOWED_LONGEST_S`) and the arm is within `ON_PATH_RAD` of where it should be by the
+        last one, or lags evenly: its lag has grown by at most `SLOWED_SHARE` of the time, and
+        it has gone at least `STANDS_SHARE` of what it is behind.
+
+        For a stop it is enough to know where the arm may be (`lost`); what leads it on is for
+        one that moves: a controller may join it to an arm that has been stopped since by a
+        jump. ``wall_s``: now, s; ``rate``: robot time per wall time.
         """
         if wall_s - seen.wall > JUST_S or not self._trail:
             return 'joint_states do not come'
@@ -213,12 +219,13 @@ class Following:
         return 'the arm is not seen to go on' if grows or stands else ''
 
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
-        """Return between which times since its start the arm is on the trajectory now, s.
+        """Return the earliest and latest time on the trajectory, s, at which the arm may be now.
 
-        The later one is where the controller's reference is: a stop takes as long to get there as
-        the move did, give or take `JITTER_S`. If the last report came late, it has gone on for so
-        long. The earlier one is where an arm is that lags, and that has been stopped by itself
-        since the last report. ``wall_s``: now, s; ``rate``: robot time per wall time.
+        Times since its start. The latest is where the controller's reference is: a stop takes
+        as long to get there as the move did, give or take `JITTER_S`; if the last report came
+        late, it has gone on for so long. The earliest is where an arm is that lags, and that
+        has been stopped by itself since the last report. ``wall_s``: now, s; ``rate``: robot
+        time per wall time.
         """
         reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
@@ -231,8 +238,9 @@ class Following:
     def has_ended(self, seen: Seen, wall_s: float, rate: float) -> bool:
         """Whether the arm is at the end of the trajectory, or will be without any command.
 
-        It is, with the lag seen last, `JITTER_S` after the trajectory's duration. ``wall_s``: now,
-        s; ``rate``: robot time per wall time.
+        That is when the time since its start, less the lag seen last and `JITTER_S`, has
+        reached the trajectory's duration. ``wall_s``: now, s; ``rate``: robot time per wall
+        time.
         """
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
         return elapsed - self._lag_s - JITTER_S * rate >= self.trajectory.duration_s
@@ -310,11 +318,11 @@ class Following:
         return longest > ON_PATH_RAD and distance <= self._rules.settle.arrive_tolerance
 
     def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
-        """Return the lag of `q`, s, its offset from the path, (k,), and whether the arm is near.
+        """Return the lag of `q`, s, its offset from the path, (k,), and whether it is near.
 
-        A lead is a negative lag. Near is what is within `ON_PATH_RAD` of where it should be: at
-        the ends of a line a small distance is a long time. The offset is in rad or m. ``elapsed``:
-        time since the start, s.
+        A lead is a negative lag. Near: the nearest place on the path is within `ON_PATH_RAD`
+        of the planned one, as at the ends of a line a small distance is a long time. The
+        offset is in rad or m. ``elapsed``: time since the start, s.
         """
         trajectory, units = self.trajectory, self._rules.units
         index, since_s = trajectory.line_at(elapsed)

@@ -21,10 +21,11 @@ OWN_PAUSE_S = 0.5
 class Interlocks:
     """Reasons not to move, each by its origin, and when each origin last gave a sign of life.
 
-    ``heartbeat_s``: longest silence of those in `NAMES`, s of wall time; ``resume_alone_s``: after
-    a longer interruption of a run only a person goes on, s of wall time.
-    Attributes: ``consent``: see `states.CONSENT`; ``paused``: whether the planner was paused, by
-    its last record; ``run``: the run of a collection that was reported last; '' before the first.
+    Origins are nodes (`NAMES`), other things observed (`OBSERVED`) and 'safety'.
+    ``heartbeat_s``: longest silence of those in `NAMES`, s of wall time; ``resume_alone_s``:
+    after a longer interruption of a run only a person goes on, s of wall time. Attributes:
+    ``consent``: see `states.CONSENT`; ``paused``: whether the planner was paused, by its last
+    record; ``run``: the run of a collection that was reported last; '' before the first.
     """
 
     def __init__(self, heartbeat_s: float, resume_alone_s: float) -> None:
@@ -45,20 +46,21 @@ class Interlocks:
         self._looked_wall: float | None = None
 
     def note_alive(self, name: str, reason: str, wall_s: float) -> None:
-        """Note a sign of life of an origin at `wall_s`, s, and its reason not to move, or ''.
+        """Note a sign of life of a node at `wall_s`, s, and its reason not to move, '' for none.
 
         ``name``: one of `NAMES`.
         """
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, state: str, run: str, wall_s: float) -> bool:
-        """Process the planner's state; return whether another collection was begun.
+        """Process the planner's state; return whether another run has taken the last one's place.
 
-        Consent is given by another run than the last one, not by a pause: a summary from before
-        may come late.
+        It is a sign of life. A run other than the last one, also the first, gives consent to
+        move, unless it appears within `KNOWN_S` of the planner's first sign of life after a
+        silence, when it may be an old one.
 
-        ``state``: anything but ``running`` is in the way; ``run``: names the run, '' if none is
-        under way; another one than before was begun by a person since; ``wall_s``: now, s.
+        ``state``: anything but ``running`` is a reason not to move; ``run``: token of the
+        collection run, '' if none is under way; ``wall_s``: now, s.
         """
         self.paused = state == 'paused'
         if self.silence_s('planner', wall_s) > self._heartbeat_s:
@@ -73,9 +75,9 @@ class Interlocks:
         return began_another
 
     def set(self, name: str, reason: str) -> None:
-        """Process an origin's reason not to move, or ''.
+        """Set an origin's reason not to move, '' for none; this is no sign of life.
 
-        ``name``: the origin, such as one of `OBSERVED`; it is no sign of life.
+        ``name``: the origin, such as one of `OBSERVED`.
         """
         self._reasons[name] = reason
 
@@ -94,9 +96,10 @@ class Interlocks:
         return self._reasons.get(name) == ''
 
     def look(self, wall_s: float) -> None:
-        """Shift the last signs of life by a pause of this process: the others were not silent.
+        """Correct the times of the last signs of life for a pause of this process.
 
-        A pause is more than `OWN_PAUSE_S` between two calls. ``wall_s``: now, s.
+        Nodes were not silent in it. A pause is more than `OWN_PAUSE_S` between two calls; the
+        times are shifted by all of that, but not into the future. ``wall_s``: now, s.
         """
         last, self._looked_wall = self._looked_wall, wall_s
         if last is None or wall_s - last <= OWN_PAUSE_S:
@@ -113,10 +116,10 @@ class Interlocks:
         return wall_s - self._seen[name] if name in self._seen else np.inf
 
     def fell_silent(self, name: str, wall_s: float) -> str:
-        """Return that an origin which gave signs of life is silent now; '' if it is not.
+        """Message that a node has been silent for more than `heartbeat_s`; else ''.
 
-        Silent is for more than `heartbeat_s`; '' also if it has given none. ``name``: one of
-        `NAMES`; ``wall_s``: now, s.
+        '' also if it has never given a sign of life. ``name``: one of `NAMES`; ``wall_s``:
+        now, s.
         """
         if name in self._seen and self.silence_s(name, wall_s) > self._heartbeat_s:
             return f'no sign of {name} for {self._heartbeat_s:g} s'
@@ -124,27 +127,29 @@ class Interlocks:
 
     @property
     def collecting(self) -> bool:
-        """Whether the planner runs a collection that a person began."""
+        """Whether the planner's last state is ``running``, with a person's consent to move.
+
+        Consent that is held, as something is in the way, counts.
+        """
         runs = 'planner' in self._seen and not self.reason('planner')
         return runs and self.consent is not Consent.ASKED
 
     def note_moved(self) -> None:
-        """Process that the arm is moved.
-
-        From then on a hindrance counts as an interruption of this run.
-        """
+        """Note that the arm is moved: from then on a reason not to move interrupts this run."""
         self._moved = True
 
     def interrupted(self, since_wall_s: float) -> None:
-        """Process that nobody has looked at the arm since then, s: this process was not there.
+        """Process that no process like this one has watched the arm since a time.
 
-        ``since_wall_s``: wall time, s; the consent is held then, see `look_at_interruption`.
+        The consent counts as held from then on, unless a person is asked for it already;
+        `look_at_interruption` decides whether a person has to go on. ``since_wall_s``: wall
+        time, s.
         """
         self._held_since_wall, self._released = since_wall_s, False
         self.say(Word.HINDERED)
 
     def stopped_on_its_way(self, wall_s: float) -> None:
-        """Process that the arm stops by itself, without a reason known to this program.
+        """Process that the arm stops on its way without any reason not to move.
 
         The consent, if it is given, is held from ``wall_s`` on, now, s; `look_at_interruption`
         decides whether a person has to go on.
@@ -159,7 +164,10 @@ class Interlocks:
         return self.was_right('safety') and not self.reason('safety_link')
 
     def revoke(self, why: str) -> None:
-        """Withdraw a person's consent to move, as they changed its terms; ``why``: for people."""
+        """Withdraw the consent to move until a person calls /remaster/collect.
+
+        ``why``: reason for people.
+        """
         self._must_collect = why
         self.say(Word.REVOKED)
 
@@ -171,11 +179,12 @@ class Interlocks:
         self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
-        """Hold the consent while something is in the way, and ask a person after a long time.
+        """Hold the consent while there is a reason not to move; after long, ask a person.
 
-        Only after the arm was moved in this run. Longer than `resume_alone_s` a person may stand
-        beside the arm; none is needed if the robot itself reported all the time that it is not
-        stopped. ``wall_s``: now, s.
+        Held only after the arm was moved in this run. After more than `resume_alone_s` a
+        person may stand beside the arm, and must call /remaster/collect if a run is known;
+        none is needed if the robot reported all the time that its safety circuit does not stop
+        it. Without a reason any more the consent is given again. ``wall_s``: now, s.
         """
         released = self._is_released
         reason = self._hindrance(wall_s)
@@ -207,14 +216,15 @@ class Interlocks:
 
     @property
     def asks_for_collect(self) -> str:
-        """Why a person must call /remaster/collect before anything moves, or ''."""
+        """Why nothing moves before a person calls /remaster/collect; '' if that is not needed."""
         asked = self.consent is Consent.ASKED
         return f'{self._must_collect}: /remaster/collect goes on' if asked else ''
 
     def _hindrance(self, wall_s: float) -> str:
-        """First reason not to move: silent nodes, then reasons in the order of the names; ''.
+        """First reason not to move, or '' if there is none: silent nodes, all in one text, first.
 
-        Silent is for more than `heartbeat_s`, or never heard; ``wall_s``: now, s.
+        Then reasons in the order of `NAMES` and `OBSERVED`. Silent: no sign of life for more
+        than `heartbeat_s`, or none ever. ``wall_s``: now, s of wall time.
         """
         limit = self._heartbeat_s
         silent = [name for name in NAMES if self.silence_s(name, wall_s) > limit]

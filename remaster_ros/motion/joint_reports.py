@@ -78,9 +78,10 @@ class ClockRate:
         self.rate = 1.0
 
     def update(self, clock_s: float, wall_s: float) -> None:
-        """Update the rate by the node's clock and the wall's, read together, s.
+        """Update `rate` by the times of the node's clock and of the wall, read together, s.
 
-        Over the last `RATE_WINDOW_S`, at least `RATE_LEAST_S`; a clock that goes back begins anew.
+        The rate is that over the last `RATE_WINDOW_S` of wall time; it stays until there are
+        times `RATE_LEAST_S` apart. If the node's clock goes back, earlier times are forgotten.
         """
         seen = self._seen
         if seen and clock_s < seen[-1][1]:
@@ -106,15 +107,15 @@ class JointReports:
     velocity
         Velocity limits of the robot itself, rad/s or m/s, (k,); infinite where unknown.
     units
-        Those of the joints.
+        Units of the joints.
 
     Attributes
     ----------
     refused
         Reason -> number of reports that were not believed.
     trouble, kind
-        Why the last report was not believed, as text and as a key of the counts; '' where it
-        was.
+        Why the last report was not believed, as text and as a key of `refused`; '' if it was
+        believed.
     late_s
         How much later than usual the last report came that was believed, s of the node's time.
     clock
@@ -173,10 +174,11 @@ class JointReports:
         return True
 
     def _doubt(self, report: JointReport) -> tuple[str, str]:
-        """Return why a report is not believed, as a key of the counts and as text; '', ''.
+        """Return why a report is not believed: key of `refused`, text; ('', '') if it is.
 
-        In this order: not finite; outside the limits by more than `LIMIT_TOLERANCE_RAD`; a stamp
-        that does not advance; faster than `SPEED_TOLERANCE` times the limit; late or early.
+        In this order: not finite; outside the limits by more than `LIMIT_TOLERANCE_RAD`; a
+        stamp that does not advance; faster than `SPEED_TOLERANCE` times the limit; late or
+        early.
         """
         q, last = report.q, self._last
         if not np.all(np.isfinite(q)):
@@ -200,10 +202,11 @@ class JointReports:
         return self._doubt_time(report)
 
     def _doubt_time(self, report: JointReport) -> tuple[str, str]:
-        """Kind ('late', 'early') and text if a report's stamp is off its time; else '', ''.
+        """Kind ('late', 'early') and text if a report's delay is unusual; else ('', '').
 
-        Off is more than `LATE_S` and a wall time times the rate from the usual delay; '', ''
-        before that is known.
+        Unusual is a difference from the usual delay of more than `LATE_S` plus `LATE_WALL_S`
+        (on a clock faster than `FAST`: `LATE_FAST_WALL_S`) times the clock's rate, at least 1.
+        ('', '') also before the usual delay is known.
         """
         if self._delay is None:
             return '', ''
@@ -217,9 +220,10 @@ class JointReports:
         return '', ''
 
     def _learn(self, report: JointReport) -> None:
-        """Update the usual delay of reports: the least of the first `LEARN`, then that of each.
+        """Update the usual delay of reports, from stamp to arrival, by a report.
 
-        It follows by at most `SHORTEN` down and `DRIFT` up, s a second.
+        It is the least of the first reports (`LEARN` and `LEARN_WALL_S` at least); then it
+        follows each report's delay by at most `SHORTEN` down and `DRIFT` up, s per second.
         """
         delay = report.clock_s - report.stamp_s
         if self._delay is None:

@@ -21,7 +21,7 @@ from remaster_ros.types import FloatArray
 
 @dataclass(frozen=True)
 class JointUnits:
-    """Which joints of an arm slide, and how far each is off."""
+    """Units of an arm's joints, rad or, of those that slide, m; and comparison of motions."""
 
     slides: tuple[bool, ...] = ()  # Base to tip; empty where all joints turn
 
@@ -40,14 +40,17 @@ class JointUnits:
         return bool(self.slides) and self.slides[joint]
 
     def largest(self, ways: FloatArray) -> float:
-        """Return the largest absolute entry of ways (..., k), rad or m, as an angle, rad.
+        """Return the largest absolute entry of joint motions (..., k), rad or m, as rad.
 
         A slide counts 1 / `LEVER_M` rad per m. Raises ValueError if there are no entries.
         """
         return float(np.max(np.abs(ways) / self.per_radian))
 
     def farthest(self, way: FloatArray) -> int:
-        """Return the index of the joint that moves farthest along a way, (k,)."""
+        """Return the index, from 0, of the joint that moves most in a way, (k,), rad or m.
+
+        A slide counts 1 / `LEVER_M` rad per m.
+        """
         return int(np.argmax(np.abs(way) / self.per_radian))
 
     # As people read them
@@ -62,9 +65,9 @@ class JointUnits:
         return f'{shown:{sign}.{digits}f} {unit}'
 
     def in_radians(self, way: FloatArray, digits: int) -> str:
-        """Return the largest joint motion of a way (k,), as text without sign, in rad or mm.
+        """Return the motion of the joint that moves most in a way, (k,), as text, in rad or mm.
 
-        ``digits``: decimals of rad; mm have two fewer.
+        Without sign. ``digits``: decimals of rad; mm have two fewer.
         """
         joint = self.farthest(way)
         value = abs(float(way[joint]))

@@ -49,11 +49,14 @@ class LedLast:
         return self._places[-1] if self._places else None
 
     def lead_to(self, *places: FloatArray) -> None:
-        """Note a command that leads to a position, rad or m, (k,), or between several of them."""
+        """Note a command that leads to a position, rad or m, (k,).
+
+        Of several positions, the arm is at one of them or on the lines from each to the next.
+        """
         self._before, self._places = self._places, places
 
     def take_back(self) -> None:
-        """Forget the last command, which was not sent: the positions before it hold again.
+        """Forget the last command, which was not sent: the positions of the one before hold again.
 
         Of two commands in a row only the last one can be taken back.
         """
@@ -67,10 +70,10 @@ class LedLast:
         return self._units.largest(q - other) > self._tolerance_rad
 
     def elsewhere(self, q: FloatArray) -> str:
-        """Return that the arm is reported elsewhere than it was led, and what to do; ''.
+        """Message that the arm is reported elsewhere than it was led, with the remedy; '' if not.
 
-        ``q``: where it is reported, rad or m, (k,). Elsewhere is farther than the tolerance from
-        all places and the lines between them; '' if no place is known.
+        ``q``: where it is reported, rad or m, (k,). Elsewhere is farther than the tolerance
+        from all positions of the last command and the lines between them; '' if none is known.
         """
         if not self._places:
             return ''
@@ -93,7 +96,10 @@ class LedLast:
         )
 
     def _nearest(self, q: FloatArray) -> FloatArray:
-        """Return the place nearest to `q`, (k,), on the lines between the places."""
+        """Return the position nearest to `q`, (k,), of those led to and the lines between them.
+
+        There must be one, else ValueError.
+        """
         scale = self._units.per_radian
         found = list(self._places)
         for start, end in pairwise(self._places):
@@ -110,9 +116,10 @@ class LedLast:
     def confirm(self, q: FloatArray) -> str:
         """Accept a reported position, (k,), if a person was asked about it before.
 
-        Returns what that person is to compare first (`elsewhere`); '' if it is accepted. It is at
-        the second call within the tolerance of the first, or after `ask`; then it is where the arm
-        was led.
+        It is accepted within the tolerance of the position of the last call, or of `ask`; then
+        it is where the arm was led, and '' is returned. Otherwise it is the position asked
+        about from then on, and what that person is to compare is returned (`elsewhere`; '' if
+        the arm is where it was led).
         """
         asked, self._asked = self._asked, q
         if asked is None or self.differs(asked, q):

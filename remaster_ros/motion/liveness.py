@@ -12,7 +12,7 @@ BACK_S = 1.0
 
 
 class Liveness:
-    """Follow the reports and readings of sensors.
+    """Record of the sensors' reports and readings, which tells which sensors are absent.
 
     Parameters
     ----------
@@ -109,10 +109,11 @@ class Liveness:
     def absent(self, now_s: float, required: Collection[str] = ()) -> dict[str, str]:
         """Return why each absent sensor counts as absent, by name; {} if none is.
 
-        Its node is silent for more than `heartbeat_s`, or reports that it is not ready; a stream
-        without a reading since its node's start is absent too. A sensor whose node never reported
-        is not, because a bag may hold readings alone; one that is ``required`` is, while its node
-        may still be starting. ``now_s``: now, s.
+        Absent: its node was silent for more than `heartbeat_s` after a report, reports that it
+        is not ready, or, of a stream, was started and has had no reading since. A sensor whose
+        node has never reported is not absent, because a bag may hold readings alone. One that
+        is ``required`` is also absent while its node may still be starting (`UNSEEN_S`,
+        `BACK_S`). ``now_s``: now, s.
         """
         why = {}
         for name in self.readings:
@@ -137,9 +138,10 @@ class Liveness:
         return self._trouble[name]
 
     def _why_unsure(self, name: str, now_s: float) -> str:
-        """Why it is too early to judge a sensor (not yet reported, just restarted), or ''.
+        """Why it is too early to count on a sensor, or ''.
 
-        Within `UNSEEN_S` of the begin, or `BACK_S` of a restart; ``now_s``: s.
+        Either there is no report and no reading of it yet, within `UNSEEN_S` of the begin of
+        listening; or its node was restarted less than `BACK_S` ago. ``now_s``: now, s.
         """
         unseen = name not in self._seen and name not in self._read
         if unseen and now_s - self._since_s < UNSEEN_S:

@@ -79,12 +79,12 @@ class MotionRefusedError(RemasterError):
 
 
 class StartMovedError(MotionRefusedError):
-    """The arm is not where the path begins that was checked."""
+    """The arm is not, or not at rest, where the motion begins that is to be sent."""
 
 
 @dataclass(frozen=True)
 class Admitted:
-    """Waypoints that may be published."""
+    """Waypoints that the gate has admitted: they may be published to the controller."""
 
     waypoints: tuple[Waypoint, ...]  # For the controller, which begins at once
     # The lines that the arm will be on; None for a stop, which stays on those of its move, and for
@@ -122,7 +122,9 @@ class MotionGate:
     def admit(
         self, path: FreePath, q: FloatArray, horizon_s: float = 0.0, *, keeps_stamps: bool = True
     ) -> Admitted:
-        """Return a move along a path that was found free, with its first piece.
+        """Check all of a move along a path that was found free; return it, or its first piece.
+
+        It is the move under way then, for `renew`, `step` and `stop`.
 
         Parameters
         ----------
@@ -131,14 +133,18 @@ class MotionGate:
         q
             Where the arm stands, rad or m, (k,).
         horizon_s
-            As of `pieces.piece_of`; 0 for all of the move at once.
+            Longest time from sending a piece of the move to the end of the piece, s, as of
+            `pieces.piece_of`; 0 to send all of the move at once.
         keeps_stamps
-            Whether the controller does; else the pieces are steps.
+            Whether the controller keeps the stamps of trajectories; if not, the pieces are steps,
+            each from rest to rest.
 
         Raises
         ------
         MotionRefusedError
-            With the limit, the value and the joint.
+            With the limit, the value and the joint; also a curve without a horizon or stamps.
+            StartMovedError, one of these, if the arm stands more than `START_RAD` from the path's
+            start.
         """
         limits = _way_out_limits(self.limits) if path.way_out else self.limits
         off = path.points[0] - q
@@ -174,12 +180,12 @@ class MotionGate:
         return Admitted(waypoints, trajectory, piece=piece)
 
     def renew(self, sent_s: float, horizon_s: float) -> Admitted:
-        """Return the next piece of the move under way, in place of the present one.
+        """Check and return the next piece of the move under way, which replaces the present one.
 
         ``sent_s``: time since the start of the move, s; ``horizon_s``: as in `admit`.
 
-        Raises MotionRefusedError as `admit`, also if nothing is left of the move; LookupError if
-        no move is under way.
+        Raises MotionRefusedError as `admit`, also if nothing is left of the move; LookupError
+        if no move is under way.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -196,13 +202,13 @@ class MotionGate:
         return Admitted(piece.waypoints, trajectory, piece=piece)
 
     def step(self, index: int, q: FloatArray) -> Admitted:
-        """Return the step of this number of the move under way, which begins at once.
+        """Check and return one line of the trajectory of the move under way, to be sent now.
 
-        ``index``: of the line of the trajectory, from 0; ``q``: where the arm stands, rad or m,
-        (k,). The waypoints have times from the step's beginning.
+        ``index``: of the line in `Trajectory.lines`, from 0; ``q``: where the arm stands, rad
+        or m, (k,). Waypoint times count from the line's start.
 
-        Raises MotionRefusedError as `admit`; StartMovedError, one of these, if the arm stands more
-        than `START_RAD` from the start; LookupError if no move is under way.
+        Raises MotionRefusedError as `admit`; StartMovedError, one of these, if the arm stands
+        more than `START_RAD` from the line's start; LookupError if no move is under way.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -223,12 +229,12 @@ class MotionGate:
     def admit_probe(self, path: FreePath, q: FloatArray, doubtful: BoolArray) -> Admitted:
         """Return a minimal move, harmless even if the arm is not where it is reported.
 
-        A controller begins it where the arm really is. It has a single waypoint, so far ahead in
-        time that from anywhere within the limits of the doubtful joints no speed and no
-        acceleration is above its limit. It cannot be stopped by `stop`.
+        A controller begins it where the arm really is. It has a single waypoint, so far ahead
+        in time that from anywhere within the limits of the doubtful joints no speed and no
+        acceleration is above its limit. Neither `stop` nor `stop_on_curve` can stop it.
 
-        ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad or m, (k,);
-        ``doubtful``: which joints may be elsewhere, (k,).
+        ``path``: from `q` to a place next to it; ``q``: where the arm is reported, rad or m,
+        (k,); ``doubtful``: which joints may be elsewhere, (k,).
 
         Raises MotionRefusedError as `admit`, also if it would take longer than `LONGEST_S`.
         """
@@ -262,19 +268,21 @@ class MotionGate:
         return Admitted(waypoints, trajectory)
 
     def stop(self, low_s: float, high_s: float) -> Admitted:
-        """Return a stop on the line that is under way.
+        """Return a stop along the line that the arm is on: one waypoint, at rest.
+
+        Another timing of what was admitted: it is not checked. On a curve that line is its
+        straight beginning; `stop_on_curve` stops an arm behind that. No move is under way
+        afterwards.
 
         Parameters
         ----------
         low_s, high_s
-            Between which times since its start the arm is on the trajectory, s.
-
-        On a curve that is its straight beginning; `stop_on_curve` stops an arm behind that.
+            Times since the start of the move between which the arm is on the trajectory, s.
 
         Raises
         ------
         LookupError
-            No move was admitted: there is nothing that could be stopped.
+            No move is under way: none was admitted, the last one was stopped, or it was a probe.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -310,12 +318,13 @@ class MotionGate:
         path: FreePath,
         limits: MotionLimits,
     ) -> None:
-        """Check each cubic from a start state on, which must end at rest.
+        """Raise MotionRefusedError unless the cubics from `start` to each waypoint are allowed.
 
-        Raises MotionRefusedError: limits less their margin (an arm outside may stay there, or go
-        inwards), speeds and accelerations (with `TOLERANCE`), `tool_speed`, more than
-        `ON_PATH_RAD` off the path (on the first cubic also what the arm stands off), or longer
-        than `LONGEST_S`.
+        Each cubic is checked: positions within the limits less their margin (an arm that
+        stands outside may stay there, or go inwards), speeds and accelerations (with
+        `TOLERANCE`), `tool_speed`, and at most `ON_PATH_RAD` off the path (on the first one,
+        before its end, `START_RAD` √k more, for what the arm stands off). Times must increase;
+        the last waypoint must be at rest, and at most `LONGEST_S` ahead.
         """
         units, q = limits.units, start.q
         low = np.minimum(limits.lower + limits.margins, q)
@@ -351,9 +360,10 @@ class MotionGate:
             raise MotionRefusedError(_too_long())
 
     def _check_point_speed(self, piece: Cubic, limits: MotionLimits) -> None:
-        """Raise MotionRefusedError if a point of arm or tool is faster than `tool_speed`.
+        """Raise MotionRefusedError if a cubic moves a point faster than `limits.tool_speed`.
 
-        Looked at every `SAMPLE_RAD`, with `TOLERANCE`; no check without a limit or `speeds`.
+        Looked at some every `SAMPLE_RAD`, with `TOLERANCE`; no check without a limit or
+        without the speeds of points.
         """
         if self._speeds is None or not np.isfinite(limits.tool_speed):
             return
@@ -369,11 +379,11 @@ class MotionGate:
 
 
 class ForeignGate:
-    """Admit trajectories of other planners.
+    """Checks trajectories of other planners against joint limits.
 
-    What leads where is theirs: no path was found free here, and nothing is known of what stands
-    in the way. What is looked at is what the controller makes of a trajectory, from where the arm
-    is: positions, speeds, accelerations, and that it ends at rest.
+    What leads where is theirs: no path was found free here, and nothing is known of what
+    stands in the way. What is looked at is what the controller makes of a trajectory, from
+    where the arm is: positions, speeds, accelerations, and that it ends at rest.
 
     Parameters
     ----------
@@ -392,21 +402,23 @@ class ForeignGate:
         *,
         is_straight: bool = False,
     ) -> Admitted:
-        """Return a trajectory that begins at once.
+        """Check a trajectory, and return it; the controller begins it at once.
 
         Parameters
         ----------
         waypoints
-            At times that ascend; none for a controller that is to hold the arm.
+            At times that ascend; none for a controller that is to hold the arm (not checked).
         q, velocity
-            Where the arm is, rad or m, and how fast, (k,); no velocity at all where it stands.
+            Where the arm is, rad or m, and how fast, per s, (k,); the velocity is 0 if it stands.
         is_straight
-            Whether the controller is given no velocities.
+            Whether the controller is given no velocities, and draws straight lines.
 
         Raises
         ------
         MotionRefusedError
             With the limit, the value and the joint.
+            StartMovedError, one of these, if the first waypoint is for time 0 and not where the
+            arm stands.
         """
         if not waypoints:
             return Admitted(())
@@ -449,11 +461,11 @@ class ForeignGate:
         return Admitted(tuple(waypoints), None, is_straight)
 
     def brake(self, q: FloatArray, velocity: FloatArray) -> Admitted:
-        """Return an even stop of an arm that goes on in its direction meanwhile.
+        """Return a stop at constant deceleration from the arm's present place and velocity.
 
-        It takes `STOP_S`, or longer for the accelerations. Without waypoints (the controller holds
-        the arm at once) if the stop would lead beyond a limit. ``q, velocity``: where the arm is,
-        rad or m, and how fast, per s, (k,).
+        It takes `STOP_S`, or longer to stay within the acceleration limits. Without waypoints
+        (the controller holds the arm at once) if the stop would lead beyond a position limit.
+        ``q, velocity``: where the arm is, rad or m, and how fast, per s, (k,).
         """
         limits = self.limits
         hardest = float(np.max(np.abs(velocity) / limits.acceleration))
@@ -464,10 +476,10 @@ class ForeignGate:
         return Admitted((Waypoint(time_s, end, np.zeros_like(end)),))
 
     def _check_start(self, first: Waypoint, q: FloatArray, velocity: FloatArray) -> None:
-        """Raise StartMovedError if the trajectory does not begin at the arm, at rest.
+        """Raise StartMovedError unless the trajectory begins where the arm is, and the arm stands.
 
-        It may begin `START_RAD` away, and the arm may move at `SLOW_RAD_S`. ``q, velocity``: where
-        the arm is, rad or m, and how fast, per s, (k,).
+        It may begin `START_RAD` away, and the arm may move at `SLOW_RAD_S`. ``q, velocity``:
+        where the arm is, rad or m, and how fast, per s, (k,).
         """
         off, units = np.abs(first.q - q), self.limits.units
         if not units.largest(off) <= START_RAD:
@@ -495,9 +507,9 @@ def _way_out_limits(limits: MotionLimits) -> MotionLimits:
 def _check_range(
     least: FloatArray, most: FloatArray, low: FloatArray, high: FloatArray, limits: MotionLimits
 ) -> None:
-    """Raise MotionRefusedError if joints, from `least` to `most`, leave `low` to `high`, (k,).
+    """Raise MotionRefusedError if a range, `least` to `most`, leaves `low` to `high`, (k,).
 
-    To rounding, 1e-9. ``limits``: for names and units.
+    By more than rounding, 1e-9. ``limits``: for names and units.
     """
     # To rounding: an arm that stands outside may stay there, and go inwards.
     bad = (least < low - 1e-9) | (most > high + 1e-9)
@@ -538,7 +550,7 @@ class Cubic:
 
     @classmethod
     def between(cls, before: Waypoint, after: Waypoint) -> Cubic:
-        """Return the cubic that meets positions and velocities of both (Hermite).
+        """Return the cubic that has two waypoints' positions and velocities (Hermite).
 
         Its coefficients are not finite if both have the same time.
         """
@@ -554,10 +566,11 @@ class Cubic:
         end_q: FloatArray,
         end_velocity: FloatArray,
     ) -> Cubic:
-        """Return the cubics by Hermite data: durations, s, (n, 1), positions and speeds (n, k).
+        """Return the cubics with given positions and velocities at both ends (Hermite).
 
-        Coefficients of a duration of 0 are not finite. Those at the start, then those at the end;
-        rad or m, per s.
+        ``q, velocity``: at the start, rad or m, per s, (n, k); ``end_q, end_velocity``: at the
+        end. ``duration_s``: s, (n, 1). Of one cubic a number and (k,). Coefficients of a
+        duration of 0 are not finite.
         """
         gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):

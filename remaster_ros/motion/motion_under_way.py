@@ -53,7 +53,7 @@ gives way under the arm's weight does so by another amount in every configuratio
 
 @dataclass
 class Visit:
-    """Move to a configuration: sent at a stamp, with a deadline to arrive, robot time."""
+    """A move that was sent: its trajectory, when it was sent, and until when it must arrive."""
 
     solution: int  # Its number; negative where nothing is measured at the end
     following: Following
@@ -68,11 +68,12 @@ class Visit:
         return self.following.trajectory
 
     def judge(self, seen: Seen, rate: float) -> Outcome:
-        """Return the outcome of a report for an arm on its way to a configuration.
+        """Return the outcome of a report, for an arm on its way to the end of the move.
 
-        'halted' if it is off its path, stands for `stall_s` off its target, or reports the target
-        to the last bit; 'settled'; 'failed' after the deadline; 'over' at the end of a move
-        without a measurement; else UNDER_WAY. ``rate``: robot time per wall time.
+        'halted' if it is off its path, stands for `stall_s` off its target, or reports the
+        target to the last bit; 'settled'; 'failed' after the deadline; 'over' at the end of a
+        probe or a way out, where nothing is measured; else UNDER_WAY. ``rate``: robot time per
+        wall time.
         """
         detector, rules = self.detector, self.rules
         trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
@@ -104,7 +105,7 @@ class Visit:
         return UNDER_WAY
 
     def set_back(self, by_s: float) -> None:
-        """Process that the rest of the move begins later by `by_s`, s."""
+        """Shift the rest of the move and its deadline later by `by_s`, s; negative for earlier."""
         self.following.set_back(by_s)
         self.deadline += by_s
 
@@ -119,10 +120,11 @@ class Visit:
         return Settled(self.solution, seen.stamp, self.detector.mean, motion_s, settle_s)
 
     def judge_settled(self, seen: Seen, *, recorder_waits: bool) -> Outcome:
-        """Outcome for an arm that must stand until the recorder answers.
+        """Return the outcome of a report, for an arm that must stand until the recorder answers.
 
-        'halted' if the arm was moved, 'failed' if the answer is late, else UNDER_WAY.
-        ``recorder_waits``: the recorder waits on purpose, so that the deadline begins anew.
+        'halted' if the arm is more than `MOVED_RAD` from its target, 'failed' if the answer is
+        late, else UNDER_WAY. ``recorder_waits``: whether the recorder waits on purpose: the
+        deadline begins anew.
         """
         moved, units = np.abs(seen.q - self.trajectory.end), self.rules.units
         if units.largest(moved) > MOVED_RAD:
@@ -138,7 +140,7 @@ class Visit:
 
 @dataclass
 class Braking:
-    """A stop under way."""
+    """A stop under way: where and when it ends."""
 
     end: FloatArray  # Where it leads, rad or m, (k,)
     # Robot time at which the arm has begun it, however late it reacts, s. Before that an arm may
@@ -153,8 +155,10 @@ class Braking:
     def judge(self, seen: Seen) -> Outcome:
         """Return the outcome of a report for a braking arm.
 
-        'over' if it stands within `near` of the stop's end; 'halted' if it stands elsewhere, or
-        goes on after the deadline; else UNDER_WAY.
+        'over' if after the stop's time it stands within `near` of the stop's end. 'halted' if
+        before that it stands for `patience_s` more than `ON_PATH_RAD` from the end, or if it
+        is not there by the deadline (later after a gap in the reports), whether it stands or
+        moves. Else UNDER_WAY.
         """
         stands, way = seen.stands(seen.wall), seen.q - self.end
         off, text = self.units.largest(way), self.units.in_radians(way, 4)
@@ -173,7 +177,7 @@ class Braking:
 
 
 def _led_now(seen: Seen, wall_s: float) -> float:
-    """Return robot time now, s, for what is sent in pieces.
+    """Robot time now, s, from the last report on at the rate of wall time; for moves in pieces.
 
     A simulated clock that runs faster than the wall's waits for each report to be taken
     (`simulated_clock.LEADS`): it is not ahead of the last one by what its rate would have.
@@ -182,12 +186,13 @@ def _led_now(seen: Seen, wall_s: float) -> float:
 
 
 class MotionUnderWay:
-    """State, visit and stop of the arm by the last command.
+    """State of the arm, and the move or stop under way by the last command.
 
-    ``gate``: every command comes from it; ``end``: where the last command led that was sent before
-    this process was started, rad or m, (k,); None if that is not known; ``state``: to begin in.
-    Attributes: ``state``: see `states.ARM`; ``led``: where the last command led; ``visit``:
-    the configuration under way, ``braking``: the stop under way; None in the states without one.
+    ``gate``: every command comes from it; ``end``: where the last command led that was sent
+    before this process was started, rad or m, (k,); None if that is not known; ``state``: to
+    begin in. Attributes: ``state``: see `states.ARM`; ``led``: where the last command led;
+    ``visit``: the move under way, also while it is measured at its end; ``braking``: the stop
+    under way; None in the states without one.
     """
 
     def __init__(
@@ -213,18 +218,18 @@ class MotionUnderWay:
         self._set_back_s = 0.0
 
     def enter(self, state: Arm) -> None:
-        """Enter a state; forget the visit and the stop that it does not have."""
+        """Enter a state; `visit` and `braking` become None in the states without one."""
         self.state = state
         self.visit = self.visit if state in HAS_VISIT else None
         self.braking = self.braking if state in HAS_STOP else None
 
     @property
     def near(self) -> float:
-        """Largest distance of an arm at rest from the end of a command, rad.
+        """Largest allowed distance of an arm at rest from the end of a command, rad.
 
-        What counts as still, and twice (`OTHER_PLACES`) the most that the reports were off where
-        it has stood: their noise, and what the servo leaves. At most the distance at which it
-        counts as arrived, and that before it has stood anywhere.
+        `still_tolerance` plus twice (`OTHER_PLACES`) the most that the reports were off where
+        the arm has settled: their noise, and what the servo leaves. At most
+        `arrive_tolerance`, and that before it has settled anywhere.
         """
         settle = self.rules.settle
         if not np.isfinite(self._stood_off):
@@ -241,14 +246,14 @@ class MotionUnderWay:
         rate: float,
         doubtful: BoolArray | None = None,
     ) -> Drive:
-        """Return the move along a free path, which is under way in the state that follows.
+        """Admit a move along a free path, and return the action that sends it.
 
-        ``solution``: its index, negative for a probe or a way out; ``path``: from where the arm
-        stands; ``seen``: the last report; ``wall_s``: now, s; ``rate``: seconds of the robot per
-        second of wall time; ``doubtful``: for a probe, which joints may be elsewhere than
-        reported, (k,). Sets `visit` and `led`.
+        Sets `visit` and `led`; `state` is not changed. ``solution``: its index, negative for a
+        probe or a way out; ``path``: from where the arm stands; ``seen``: the last report;
+        ``wall_s``: now, s; ``rate``: robot time per wall time; ``doubtful``: for a probe,
+        which joints may be elsewhere than reported, (k,), else None.
 
-        Raises MotionRefusedError as `MotionGate.admit`; nothing is under way then.
+        Raises MotionRefusedError as `MotionGate.admit`; nothing is changed then.
         """
         if doubtful is None:
             admitted = self.gate.admit(
@@ -277,22 +282,31 @@ class MotionUnderWay:
 
     @property
     def next_end(self) -> FloatArray | None:
-        """End of the next piece of the move, rad or m, (k,); None without a move."""
+        """End of the next piece of a move that is sent in pieces, rad or m, (k,); else None.
+
+        Of the last piece its own end.
+        """
         return None if self.visit is None or self._piece is None else self._piece.next_end
 
     @property
     def patience_s(self) -> float:
-        """Longest delay of the next piece of a move after it is due, s of robot time."""
+        """Longest delay of a move's next piece before `due` returns 'missed', s of robot time.
+
+        A long move is sent in pieces. With stamps it counts from `RENEWED_S` after the last
+        piece was sent; without, it is `STEP_REST_S` from the end of the last step.
+        """
         if not self._keeps_stamps:
             return STEP_REST_S
         return self._horizon_s - RAMP_S - GUARD_S - RENEWED_S
 
     def due(self, seen: Seen, wall_s: float) -> Literal['', 'renew', 'missed']:
-        """Whether the next piece of the move is due ('renew'), or too late ('missed'); '' if not.
+        """Return 'renew' if the move's next piece is due now, 'missed' if too late, else ''.
 
-        ``wall_s``: now, s. With stamps it is due `RENEWED_S` after the last one, and too late
-        `GUARD_S` before the piece's stop begins. Else it is due when the arm stands at the piece's
-        end. '' after the last piece.
+        '' also without a move in pieces, and after its last piece. With stamps a piece is due
+        `RENEWED_S` after the last one was sent (not before `JOINED_S`), and too late from
+        `GUARD_S` before that one's stop begins. Without, it is due when the arm stands at the
+        end of the last step, and too late when the planned rest there is over. ``wall_s``:
+        now, s.
         """
         piece, visit = self._piece, self.visit
         if piece is None or visit is None or piece.is_last:
@@ -309,12 +323,13 @@ class MotionUnderWay:
         return 'renew' if elapsed_s >= max(self._piece_sent_s + RENEWED_S, JOINED_S) else ''
 
     def renew(self, seen: Seen, wall_s: float) -> Renew:
-        """Return the next piece of the move, which is the present one from then on.
+        """Return the action that sends the next piece of the move, the present one from then on.
 
-        ``wall_s``: now, s.
+        Without stamps it is the next step, and the times of the rest of the move are shifted
+        so that it begins now, sooner or later than planned. ``wall_s``: now, s.
 
         Raises MotionRefusedError as `MotionGate.renew` and `MotionGate.step`. There must be a
-        visit.
+        move in pieces.
         """
         assert self.visit is not None
         assert self._piece is not None
@@ -343,7 +358,7 @@ class MotionUnderWay:
         self._piece, self._piece_sent_s = piece, sent_s
 
     def end_piece(self, seen: Seen, wall_s: float, rate: float) -> None:
-        """Watch the present piece end in its stop, as no further one is sent.
+        """Begin to watch the present piece end in its stop, as no further one is sent.
 
         Sets `braking`; there must be a visit and a piece. ``rate``: robot time per wall time.
         """
@@ -354,10 +369,11 @@ class MotionUnderWay:
         self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
-        """Return the outcome of a report for the move or the stop; UNDER_WAY without either.
+        """Return the outcome of a report for the stop, or else the move; UNDER_WAY without either.
 
-        See `Visit` and `Braking`. How far the arm has settled from its target is kept, for `near`.
-        ``rate``: robot time per wall time; ``recorder_waits``: as of `Visit.judge_settled`.
+        As of `Braking.judge`, `Visit.judge`, or in `Arm.MEASURES` `Visit.judge_settled`. How
+        far a settled arm is from its target is kept, for `near`. ``rate``: robot time per wall
+        time; ``recorder_waits``: as of `Visit.judge_settled`.
         """
         if self.braking is not None:
             return self.braking.judge(seen)
@@ -391,10 +407,10 @@ class MotionUnderWay:
         return self.visit.following.unseen(seen, wall_s, rate)
 
     def stop(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop | None:
-        """Return the stop of a moving arm that is not `lost`, along the rest of its line.
+        """Return the stop of a moving arm along its line or curve, which `braking` watches.
 
-        It is watched from then on (`braking`). None, and nothing is changed, if the arm is at its
-        end or will be without any command. ``reason``: for people; ``wall_s``: now, s; ``rate``:
+        The arm must not be `lost`. None, and nothing is changed, if the arm is at its end, or
+        will be without any command. ``reason``: for people; ``wall_s``: now, s; ``rate``:
         robot time per wall time. There must be a visit.
         """
         assert self.visit is not None
@@ -438,9 +454,10 @@ class MotionUnderWay:
         return Stop(admitted, reason, wall_s, following.sent)
 
     def _brake(self, end: FloatArray, begins: float, over: float, rate: float) -> None:
-        """Begin to watch a stop at `end`, (k,), from `begins` to `over`, robot time, s.
+        """Set `braking` to a stop that ends at `end`, rad or m, (k,).
 
-        ``rate``: robot time per wall time; above 1 it lengthens the patience.
+        ``begins``: robot time at which the arm has begun it, s; ``over``: at which it has
+        ended. ``rate``: robot time per wall time; above 1 it lengthens the patience.
         """
         patience_s = ASTRAY_S * max(rate, 1.0)
         deadline = over + max(STOPPED_S, patience_s)
@@ -448,9 +465,11 @@ class MotionUnderWay:
         self.braking = Braking(end, begins, over, deadline, self.near, patience_s, units)
 
     def take_back(self) -> None:
-        """Forget the last command, which was not sent: end, piece and times before it hold again.
+        """Take the last command back, which was not sent; the state is not changed.
 
-        The state is not changed.
+        Where the arm was led, the piece of the move that was sent and when, and the times of
+        the visit are those before the command. Only the last of two commands can be taken
+        back.
         """
         self.led.take_back()
         self._piece, self._piece_sent_s = self._piece_before

@@ -30,10 +30,10 @@ NO_REFUSALS: Mapping[int, str] = {}
 
 
 class MoveQueue:
-    """The configurations of a pose in the order of visiting, and the path that is asked for.
+    """The configurations of a pose in the order of visiting, and the last path that was asked for.
 
-    Attributes: ``next``: the number of the next solution; ``place``: see `states.PLACE`; it says
-    what must come before any solution.
+    Attributes: ``next``: the index of the next solution; ``place``: see `states.PLACE`; it
+    says what must come before any solution.
     """
 
     def __init__(self) -> None:
@@ -69,7 +69,7 @@ class MoveQueue:
         self.place = after(PLACE, self.place, finding)
 
     def clear_halt(self) -> None:
-        """Note that a person has cleared a halt, which allows the way out that was offered."""
+        """Note that a person has cleared a halt, and so allowed a way out that was offered."""
         self._way_out, self._offered = self._offered, None
         self.found(Finding.CLEARED if self._way_out is None else Finding.ALLOWED)
 
@@ -94,10 +94,10 @@ class MoveQueue:
         return self._refused.get(self.next, '')
 
     def ask(self, solution: int, start: FloatArray, target: FloatArray) -> CheckPath:
-        """Return the question whether the way to a solution is free, with a new number.
+        """Return a request to check whether the way to a solution is free, with a new number.
 
-        ``solution``: its index, or `STANDING`; ``start, target``: rad or m, (k,). The planner's
-        waypoints to it are included. `asked` answers for the last question only.
+        ``solution``: its index, or `STANDING`; ``start, target``: rad or m, (k,). The
+        planner's waypoints to it are included. `asked` answers for the last request only.
         """
         self._requests += 1
         none = np.empty((0, len(target)))
@@ -108,19 +108,20 @@ class MoveQueue:
         return asked
 
     def asked(self, number: int) -> tuple[int, FloatArray] | None:
-        """Return the solution and the start, (k,), of the last question if it has this number.
+        """Return solution and start, (k,), of the last request of `ask` if it has this number.
 
-        None if it has another one, or none was asked.
+        None if it has another one, or there was none.
         """
         if self._asked is None or self._asked[1].number != number:
             return None
         return self._asked[0], self._asked[1].start
 
     def offer(self, answer: PathAnswer, limits: MotionLimits) -> str:
-        """Keep a way out for the person who clears the halt; return what to tell that person.
+        """Keep a way out for the person who clears the halt; return the reason of the halt.
 
-        ``answer``: that the arm stands where it must not, and the way out, if one is known;
-        ``limits``: of the arm, for the names and the units of its joints.
+        The reason names the contact, and the way out or that none is known. ``answer``: that
+        the arm stands where it must not; ``limits``: of the arm, for the names and the units
+        of its joints.
         """
         self._offered = answer.way_out
         stands = f'the arm stands where it must not: {answer.why}'
@@ -139,10 +140,10 @@ class MoveQueue:
 
 
 def probe_path(q: FloatArray, limits: MotionLimits) -> FreePath:
-    """Return the way to a place `PROBE_RAD` from `q`, where the arm stands (rad or m, (k,)).
+    """Return the way of a probe: from `q`, where the arm stands (rad or m, (k,)), by `PROBE_RAD`.
 
-    Each joint goes towards the middle of its range. A measurement does not agree with the end to
-    the last bit.
+    Each joint moves towards the middle of its range, by that or, if it slides, `per_radian`
+    times as much. Reports that are measured do not agree with its end to the last bit.
     """
     low, high = np.clip((limits.lower, limits.upper), -1e3, 1e3)
     step = PROBE_RAD * limits.units.per_radian

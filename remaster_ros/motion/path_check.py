@@ -107,11 +107,11 @@ class PointSpeeds:
 
 
 def _carried(T: FloatArray) -> FloatArray:
-    """Return the matrix (6, 6) from a frame's turn and velocity to those of a frame fixed in it.
+    """Return the matrix (6, 6) from the twist of a frame to that of a frame fixed in it.
 
-    ``T``: the fixed frame, (4, 4). To be multiplied from the right to rows of turn and velocity.
-
-    Its origin moves with v + w × p.
+    A twist is a row of angular velocity and velocity of the origin, each in its own frame's
+    axes; it is multiplied by the matrix from the right. ``T``: the fixed frame in the first
+    one, (4, 4). Its origin moves with v + w × p.
     """
     rotation = T[:3, :3]
     across = np.cross(np.eye(3), T[:3, 3])
@@ -119,10 +119,10 @@ def _carried(T: FloatArray) -> FloatArray:
 
 
 def _velocities(points: FloatArray) -> FloatArray:
-    """Return the matrix (6, 3 n) from a frame's turn and velocity to velocities of points.
+    """Return the matrix (6, 3 n) from the twist of a frame to velocities of points fixed in it.
 
-    ``points``: fixed in the frame, (n, 3). To be multiplied from the right; columns are the
-    points' x, then y, then z.
+    ``points``: in the frame, (n, 3). To be multiplied from the right to rows of angular
+    velocity and velocity of the origin; columns are the points' x, then y, then z.
     """
     across = np.cross(np.eye(3)[:, None], points)
     by_turn = np.moveaxis(across, 1, 2).reshape(3, -1)
@@ -142,18 +142,20 @@ class FreePath:
     curve: Spline | None = None  # What the arm follows in place of the polyline
 
     def offs(self, q: FloatArray, units: JointUnits) -> FloatArray:
-        """Return the ways to configurations from the nearest places on the path, rad or m, (n, k).
+        """Return the offsets of configurations, rad or m, (n, k), from the path, (n, k).
 
-        On a curve the nearest by the sum of squares, on a polyline as of `off`.
+        From the nearest place on the path: on a curve by the sum of squares, on a polyline as
+        of `off`.
         """
         if self.curve is not None:
             return np.asarray(q - self.curve.at(self.curve.nearest(q, units)))
         return np.array([self.off(each, units) for each in q])
 
     def off(self, q: FloatArray, units: JointUnits) -> FloatArray:
-        """Return the way to a configuration (rad or m, (k,)) from the nearest on the polyline.
+        """Return the offset of a configuration, rad or m, (k,), from the polyline, (k,).
 
-        Nearest along each line by the sum of squares, among the lines by the largest joint.
+        From the nearest place on it: along each line by the sum of squares, among the lines by
+        the largest joint.
         """
         points = self.points / units.per_radian
         starts, ways, here = points[:-1], np.diff(points, axis=0), q / units.per_radian

@@ -30,10 +30,10 @@ class PathSearch:
         self._model, self._speeds = model, speeds
 
     def find(self, request: CheckPath) -> PathAnswer:
-        """Free path for a request: the planned one, or another.
+        """Answer a request with a free path: the planned one if it is free, or another.
 
-        Without one: what is in the way and, from a start that is not free, a way out if known. The
-        same request always has the same answer. It takes up to seconds.
+        Without one: what is in the way and, from a start that is not free, a way out if known.
+        The same request always has the same answer. It takes up to seconds.
         """
         rng = np.random.default_rng(SEED)
         at_start = self._model.trouble(request.start)
@@ -53,10 +53,11 @@ class PathSearch:
         return PathAnswer(None, trouble) if found is None else PathAnswer(self._path(found))
 
     def _curve(self, request: CheckPath) -> FreePath | None:
-        """Return the curve of a request as a path; None without one, or if it is not free.
+        """Return the curve of a request as a path; None if it has no curve, or that is not free.
 
-        Nor is there one for an arm that stands elsewhere than at its beginning (`BEGINS_RAD`):
-        it was stopped on its way, say, and goes to the target by any free path.
+        None also for an arm that stands elsewhere than at the curve's beginning
+        (`BEGINS_RAD`): it was stopped on its way, say, and goes to the target by any free
+        path.
         """
         shares, points = request.shares, request.waypoints
         if not len(shares):
@@ -82,6 +83,9 @@ class PathSearch:
 
 
 def beside_chords_m(model: CollisionModel) -> float:
-    """Return how far a body may be beside its place on the chords of a curve's samples, m."""
+    """Bound on the relative motion of two bodies from a curve to the chords of its samples, m.
+
+    No joint is further than `SAGITTA_RAD` from these chords.
+    """
     joints = len(model.chain)
     return model.travel(np.zeros(joints), np.full(joints, SAGITTA_RAD))

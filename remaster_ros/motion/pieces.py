@@ -57,7 +57,7 @@ SAME_S = 1e-6
 
 @dataclass(frozen=True)
 class Piece:
-    """A part of a trajectory that ends at rest."""
+    """A part of a move that the controller is sent as one trajectory; it ends at rest."""
 
     waypoints: tuple[Waypoint, ...]  # At times from the trajectory's start
     # Until when the arm is on the trajectory, s from its start; infinite for the last piece
@@ -84,8 +84,8 @@ class Piece:
 def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
     """Return the piece of a trajectory to be sent at `sent_s`, s from its start.
 
-    ``horizon_s``: time from then to the piece's end, s. It begins before `sent_s`, by up to
-    `PAST_S`, and is the last one if the trajectory ends within the horizon.
+    ``horizon_s``: longest time from then to the piece's end, s. The piece begins up to
+    `PAST_S` before `sent_s`, and is the last one if the trajectory ends within the horizon.
     """
     piece = _piece(trajectory, sent_s, horizon_s)
     following = _piece(trajectory, sent_s + RENEWED_S, horizon_s)[0]
@@ -93,19 +93,21 @@ def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
 
 
 def stop_of(trajectory: Trajectory, sent_s: float, cut_s: float) -> Piece:
-    """Return the piece that stops an arm on a curve, if the curve does not end before.
+    """Return the piece by which an arm on a curve stops, or ends with the curve if that is sooner.
 
-    ``sent_s``: when it is sent, ``cut_s``: from where on it differs from the curve, both s from
-    the trajectory's start. The controller is on the curve when the piece comes, and goes on.
+    ``sent_s``: when it is sent, ``cut_s``: from where on it differs from the curve, both s
+    from the trajectory's start. The controller is on the curve when the piece comes, and goes
+    on.
     """
     points, cut_s = _piece(trajectory, sent_s, cut_s - sent_s + RAMP_S)
     return Piece(points, cut_s, points[-1].q)
 
 
 def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
-    """Return a trajectory along the same lines that rests every `horizon_s` at the latest.
+    """Return a trajectory along the same lines that comes to rest every `horizon_s` at the latest.
 
-    Each line is cut into equal steps, from rest to rest, with `STEP_REST_S` between them.
+    Each line is cut into equal steps, from rest to rest, with rests of `STEP_REST_S` between
+    them. AssertionError for a curve.
     """
     lines: list[Line] = []
     for line in trajectory.lines:
@@ -120,9 +122,9 @@ def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
 
 
 def step_of(trajectory: Trajectory, index: int) -> Piece:
-    """Return the line of this number, from 0, as a piece, with times of the trajectory.
+    """Return one line of a trajectory as a piece, with times from the trajectory's start.
 
-    It is the last piece if it is the last line.
+    ``index``: of the line, from 0; the piece of the last line is the last one.
     """
     line, start_s = trajectory.lines[index], trajectory.starts_s[index]
     points = tuple(replace(p, time_s=start_s + p.time_s) for p in line.waypoints())
@@ -135,7 +137,7 @@ def step_of(trajectory: Trajectory, index: int) -> Piece:
 def _piece(
     trajectory: Trajectory, sent_s: float, horizon_s: float
 ) -> tuple[tuple[Waypoint, ...], float]:
-    """Return the waypoints, and until when the arm is on the trajectory, s (inf for the last).
+    """Return waypoints of a piece, and until when it follows the trajectory, s (inf for the last).
 
     Behind that is a stop in `RAMP_S` on the line; a line's own ramp is taken if the stop would
     fall into it. ``sent_s``: s from the trajectory's start; ``horizon_s``: as of `piece_of`.

@@ -37,8 +37,8 @@ class Facts:
 def preflight(facts: Facts) -> tuple[str, ...]:
     """Return obstacles to the first motion, one line each; () if it may begin.
 
-    What is older than `FRESH_S` is missing. Troubles of sensors count unless `any_sensor`, and one
-    of them is ready.
+    What is older than `FRESH_S` is missing. Sensors that are not ready are obstacles, except
+    if `any_sensor` is set and at least one of them is ready.
     """
     findings = []
     if facts.joints_message:

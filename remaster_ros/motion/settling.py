@@ -48,8 +48,9 @@ class SettleDetector:
     """Judge from reported joint positions whether the arm stands still at its target.
 
     The arm is *still* since the first report from which on no joint's spread exceeds
-    ``still_tolerance``; it has *settled* when that has lasted ``settle_s`` at the target.
-    A slow drift breaks the spread and starts the waiting anew, unlike a velocity threshold.
+    ``still_tolerance``; it has *settled* when that has lasted ``settle_s`` and it is at the
+    target. A slow drift breaks the spread and starts the waiting anew, unlike a velocity
+    threshold.
 
     ``target``: commanded joint positions, rad or m, shape (k,).
     """
@@ -61,10 +62,13 @@ class SettleDetector:
     def update(self, stamp: float, q: FloatArray) -> SettleState:
         """Process one report and return the state.
 
+        Still for `settle_s`: 'settled' if within `arrive_tolerance` of the target, else
+        'elsewhere'. Not still for so long: 'settling' if within it, else 'moving', whether or
+        not the joints move. 'moving' also if a position is not finite; the standstill is
+        forgotten then.
+
         ``stamp``: time of the report, s; ``q``: reported joint positions in the order of the
-        target, rad or m, (k,). Still for `settle_s`: 'settled' within `arrive_tolerance` of the
-        target, else 'elsewhere'. Before that: 'settling' and 'moving'; 'moving' also if a position
-        is not finite.
+        target, rad or m, (k,).
         """
         if not np.all(np.isfinite(q)):
             self._still = None

@@ -47,8 +47,8 @@ class Spline:
     def through(cls, points: FloatArray, shares: FloatArray) -> Spline:
         """Return the natural cubic spline through configurations.
 
-        Between the first two and the last two, `STRAIGHT_SHARE` is a straight piece: its inner end
-        is where the second derivative vanishes and the first one is continuous.
+        Between the first two and the last two, `STRAIGHT_SHARE` is a straight piece: its inner
+        end is where the second derivative vanishes and the first one is continuous.
 
         Parameters
         ----------
@@ -60,7 +60,8 @@ class Spline:
         Raises
         ------
         ValueError
-            Other shapes, shares that do not ascend, or more than `MOST_SAMPLES` samples.
+            Other shapes, more than `MOST_POINTS` points, points that are not finite, shares that
+            do not ascend, or more than `MOST_SAMPLES` samples.
         """
         q, s = np.asarray(points, dtype=float), np.asarray(shares, dtype=float)
         if q.ndim != 2 or len(q) < 3 or s.shape != (len(q),):
@@ -168,11 +169,12 @@ class Spline:
 
 
 def _natural(q: FloatArray, knots: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return places and second derivatives at the knots, (m + 1, k) each.
+    """Return the curve's positions and second derivatives at the knots, (m + 1, k) each.
 
-    ``q``: at all knots but the second and the last but one, (m - 1, k). The second derivative is
-    zero at the first two and the last two knots; where the curve is at the second and the last but
-    one follows from its slope, which is continuous at every inner knot.
+    ``q``: positions at all knots but the second and the last but one, (m - 1, k). The second
+    derivative is zero at the first two and the last two knots; where the curve is at the
+    second and the last but one follows from its slope, which is continuous at every inner
+    knot.
     """
     h, last = np.diff(knots), len(knots) - 1
     # One row for the slope at each inner knot; columns are the second derivatives at the knots 2

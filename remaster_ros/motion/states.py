@@ -80,9 +80,9 @@ class Then:
 
 
 def _always(state: Arm) -> dict[Event, Then]:
-    """Return the rows of most states: a halt halts, and a stop needs no command.
+    """Return the transitions of most states: a halt halts, and a stop needs no command.
 
-    ``state``: that of the rows, which a stop does not change.
+    ``state``: that of the rows of the table, which a stop does not change.
     """
     return {
         Event.STOP: Then(state),
@@ -92,7 +92,7 @@ def _always(state: Arm) -> dict[Event, Then]:
 
 
 def _commanded(state: Arm) -> dict[Event, Then]:
-    """Return the rows of a state with a move under way, in which a stop is commanded.
+    """Return the transitions of a state with a move under way, in which a stop is commanded.
 
     ``state``: `Arm.LEAVES` or `Arm.MOVES`.
     """

@@ -41,8 +41,9 @@ def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) 
     """Return position and time at which an arm on a line comes to rest if it stops now.
 
     ``low_s, high_s``: the arm's place is that of the line at a time between these, s since its
-    start; ``limits``: for the accelerations. The shortest stop of at least `STOP_S` that is right
-    from all of these places; else the longest shorter one; else one in the time left on the line.
+    start; ``limits``: for the accelerations. It is the shortest stop of those tried of at
+    least `STOP_S` that is right (`_Stretch.first`) from all of these places; else the longest
+    shorter one; else one in the time left on the line. The waypoint's time is from now.
     """
     stretch = _Stretch(line, low_s, high_s, limits)
     longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))
@@ -55,7 +56,7 @@ def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) 
 
 
 class _Stretch:
-    """Places on a line at which an arm may be, and stops from all of them."""
+    """The places on a line at which an arm may be, and stops that are right from all of them."""
 
     def __init__(self, line: Line, low_s: float, high_s: float, limits: MotionLimits) -> None:
         kinks = [time for time in line.kinks_s if low_s < time < high_s]
@@ -68,8 +69,9 @@ class _Stretch:
     def first(self, times: FloatArray) -> tuple[float, float] | None:
         """Return time (s) and end (share) of the first stop that is right; None if none is.
 
-        ``times``: durations to try, s, (n,), in this order. Right is the inequality of the module,
-        and accelerations of at most `HEADROOM` times the limit.
+        ``times``: durations to try, s, (n,), in this order. Right: from every place of the
+        stretch its cubic stays on the line, up to the stop's end, never goes back, and has at
+        most the cruising speed and `HEADROOM` times the acceleration limits.
         """
         x, v, T = self._x[:, None], self._v[:, None], times
         least = np.max(x + v * T / 3, axis=0)
@@ -86,7 +88,7 @@ class _Stretch:
         return None
 
     def rest_of_line(self) -> tuple[float, float]:
-        """Return time and end of a stop in the time that the slowest has left on the line.
+        """Return time, s, and end of a stop in the time that the slowest arm has left on the line.
 
         The end, a share of the line, is the farthest at which no arm of the stretch passes the
         line's end.
@@ -99,9 +101,10 @@ class _Stretch:
         return time, low
 
     def _coefficients(self, time: float, end: float) -> tuple[FloatArray, FloatArray]:
-        """Return second and third coefficients of the cubics, of powers of the time's share.
+        """Return the quadratic and cubic coefficients of the stops from each place, (n,) each.
 
-        One for each place; ``time``: of the stop, s; ``end``: share of the line.
+        Of powers of the share of the stop's time. ``time``: of the stop, s; ``end``: share of
+        the line.
         """
         gap, v = end - self._x, self._v * time
         return 3 * gap - 2 * v, v - 2 * gap

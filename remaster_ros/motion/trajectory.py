@@ -56,7 +56,7 @@ class Waypoint:
 
 @dataclass(frozen=True)
 class RampedPath:
-    """A path from rest to rest: its share goes up a ramp, cruises, and goes down a ramp."""
+    """A path from rest to rest, whose speed has a ramp up, a cruise and a ramp down."""
 
     # Joint positions at rest, rad or m, (k,)
     start: FloatArray
@@ -107,11 +107,12 @@ class Line(RampedPath):
     def within(
         cls, limits: MotionLimits, start: FloatArray, end: FloatArray, peak_m: float = 0.0
     ) -> Line:
-        """Return the fastest line within the speeds and accelerations, less `HEADROOM`.
+        """Return the fastest line within `HEADROOM` times the speeds and accelerations.
 
-        ``start, end``: rad or m, (k,); ``peak_m``: speed of the fastest point of arm and tool if
-        the whole way takes a second, m/s; 0 for no such limit. Accelerations count `STOPPABLE`
-        times.
+        ``start, end``: rad or m, (k,); ``peak_m``: speed of the fastest point of arm and tool
+        if the whole way takes a second, m/s; 0 for no such limit. Accelerations count
+        `STOPPABLE` times. At the least rate, 0.1 / `LONGEST_S`, the line takes too long for
+        the gate.
         """
         way = np.maximum(np.abs(end - start), 1e-12)
         # The ramp is of a given length: what the joints may accelerate bounds the speed as well.
@@ -125,7 +126,7 @@ class Line(RampedPath):
 
     @property
     def way(self) -> FloatArray:
-        """From start to end, rad or m, (k,)."""
+        """Motion from start to end, rad or m, (k,)."""
         return self.end - self.start
 
     @property
@@ -139,7 +140,10 @@ class Line(RampedPath):
         return self.start + share * self.way, rate * self.way
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the ends of ramp up, cruise and ramp down; no cruise if there is none."""
+        """Return the waypoints at the ends of ramp up, cruise (if there is one) and ramp down.
+
+        Times are from the line's start, which is no waypoint.
+        """
         velocity, ramp = self.rate * self.way, 0.5 * RAMP_S * self.rate * self.way
         points = [Waypoint(RAMP_S, self.start + ramp, velocity)]
         if self.rate * RAMP_S < NO_CRUISE:
@@ -175,17 +179,19 @@ class Line(RampedPath):
 
 @dataclass(frozen=True, eq=False)
 class Curve(RampedPath):
-    """A spline gone at a constant rate of its share, but for the ramps."""
+    """A spline gone at a constant rate of its share, except on the ramps at both ends."""
 
     spline: Spline
 
     @classmethod
     def within(cls, limits: MotionLimits, spline: Spline, peak_m: float = 0.0) -> Curve:
-        """Return the fastest motion along a spline within the limits, less `HEADROOM`.
+        """Return the fastest motion along a spline within `HEADROOM` times the limits.
 
-        At every place within the speeds, and within the accelerations also of a stop in `RAMP_S`
-        from there. The straight piece at the beginning is begun and stopped as a line is, and
-        takes at least `LEAD_S`; that at the end holds the ramp. ``peak_m``: as of `Line.within`.
+        At every place within the speeds, and within the accelerations also of a stop in
+        `RAMP_S` from there. The straight piece at the beginning is begun and stopped as a line
+        is, and takes at least `LEAD_S`; that at the end holds the ramp. ``peak_m``: as of
+        `Line.within`. At the least rate, 0.1 / `LONGEST_S`, the motion takes too long for the
+        gate.
         """
         rate = min(
             float(np.min(allowed_rates(limits, spline))),
@@ -198,9 +204,9 @@ class Curve(RampedPath):
 
     @property
     def lead(self) -> Line:
-        """The straight piece at the beginning, as a line of the same motion.
+        """The straight piece at the beginning, as a line at the same speed.
 
-        Until the line's ramp down, which the curve does not have.
+        Curve and line are the same motion until the line's ramp down begins.
         """
         until = self.spline.straight_until
         return Line(self.start, self.place(until), self.rate / until)
@@ -220,9 +226,9 @@ class Curve(RampedPath):
         return self.spline.at(np.array([share]))[0]
 
     def waypoints(self) -> tuple[Waypoint, ...]:
-        """Return the end of the ramp up, the spline's knots, the ramp's begin, and the end.
+        """Return waypoints at the end of the ramp up, knots, the begin of the ramp down, the end.
 
-        Between two of them the curve is one cubic of time.
+        Between two of them the curve is one cubic of time. Times are from the curve's start.
         """
         begins_s, ends_s = self.kinks_s
         low, high = self.share(begins_s)[0], self.share(ends_s)[0]
@@ -260,8 +266,9 @@ class Curve(RampedPath):
 def allowed_rates(limits: MotionLimits, spline: Spline) -> FloatArray:
     """Return the largest rate of the share at each sample of a spline, 1/s, (p,).
 
-    By the speeds and accelerations, the latter also of a stop in `RAMP_S` from there; on the
-    straight beginning by those of a line. Less `HEADROOM`; the speeds of points are not looked at.
+    By `HEADROOM` times the speeds and accelerations, the latter also of a stop in `RAMP_S`
+    from there; on the straight beginning also as of a line. The speeds of points are not
+    looked at.
     """
     shares, _ = spline.samples
     first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
@@ -285,7 +292,7 @@ def _ramp(time_s: float) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Lines one after the other, with a rest between them; or a curve."""
+    """Lines one after the other, with a rest between them; or a single curve."""
 
     lines: tuple[Line | Curve, ...]
     rest_s: float = REST_S  # Between two lines
@@ -357,17 +364,17 @@ class Trajectory:
 def plan_trajectory(
     limits: MotionLimits, points: FloatArray, peaks_m: tuple[float, ...] = ()
 ) -> Trajectory:
-    """Return the trajectory along a polyline.
+    """Return the fastest trajectory along a polyline, which rests at each corner.
 
     Parameters
     ----------
     limits
         Its speeds and accelerations.
     points
-        rad, (n + 1, k).
+        Corners, rad or m, (n + 1, k).
     peaks_m
         For each line the speed of the fastest point where the whole way takes a second, m/s, (n,);
-        none if no such limit is kept.
+        () if no such limit is kept.
     """
     peaks = peaks_m or (0.0,) * (len(points) - 1)
     return Trajectory(

@@ -21,11 +21,12 @@ NUMBER = 'publication_sequence_number'
 
 
 class ArmStates:
-    """Take joint positions of an arm from joint_states, whoever else publishes there.
+    """Joint positions of an arm from joint_states, on which other devices may publish as well.
 
-    ``hold_s``: a second publisher counts for so long after it was noticed last, s of wall time.
-    Attributes: ``others``: what a message is that has none of the arm's joints, for whom the arm's
-    do not come; ''.
+    ``hold_s``: a second publisher of the arm's joints is reported for so long after it was
+    last noticed, s of wall time.
+    Attributes: ``others``: sentence on the last message that names none of the arm's joints;
+    '' if none has come.
     """
 
     def __init__(self, node: Node, names: Sequence[str], hold_s: float) -> None:
@@ -40,18 +41,19 @@ class ArmStates:
         self.others = ''
 
     def take(self, message: JointState, info: Mapping[str, Any]) -> FloatArray | None:
-        """Return the arm's positions, rad or m, (k,); None from a message of another device.
+        """Return the arm's joint positions in a message, rad or m, (k,).
 
-        ``info``: rclpy's of the message. Raises InputError as `JointOrder.positions`. Notes a
-        rival too.
+        None if the message names no joint of the arm. ``info``: message info of rclpy. Raises
+        InputError as `JointOrder.positions`. A second publisher is noted as by `note`.
         """
         return self._order.positions(message) if self.note(message, info) else None
 
     def note(self, message: JointState, info: Mapping[str, Any]) -> bool:
-        """Note a rival publisher of joint states; return whether the message is of this arm.
+        """Note a second publisher of the arm's joints; return whether a message names any of them.
 
-        A rival shows by `NUMBER` in `info`, where it does not increase from message to message. A
-        message that names no joint of the arm sets `others`.
+        A second publisher shows if the publication sequence number in `info` (message info of
+        rclpy) does not increase from one message of the arm to the next. A message that names
+        no joint of the arm only sets `others`.
         """
         if not self._order.concerns(message):
             found = ', '.join(message.name) or 'no joints'
@@ -67,9 +69,10 @@ class ArmStates:
         return True
 
     def rival(self) -> str:
-        """Return that the arm's joints come from several publishers, with the nodes; '' if not.
+        """Sentence that several publishers send the arm's joints, with their nodes; '' if not.
 
-        Until `hold_s` after a rival was noticed; by the graph if messages have no numbers.
+        Returned for `hold_s` after a second publisher was last noticed. If messages have no
+        sequence numbers, all publishers of the topic in the ROS graph count (`OnlyPublisher`).
         """
         if self._is_counted:
             # Nothing but the graph tells publishers apart.

@@ -26,7 +26,7 @@ MOVED_RAD = 0.005
 
 
 class Background:
-    """A thread that does one job after the other; a node's callbacks get the results."""
+    """Thread that runs one job after the other, and gives the results to a node's callbacks."""
 
     def __init__(self, node: Node) -> None:
         self._work: SimpleQueue[tuple[Work, Then] | None] = SimpleQueue()
@@ -36,9 +36,10 @@ class Background:
         self._thread.start()
 
     def submit(self, work: Work, then: Then) -> None:
-        """Queue a job for the thread; call `then` with its result among the node's callbacks.
+        """Queue a job for the thread, and return; `then` is called later with the job's result.
 
-        If the job raises an exception, that is the result.
+        `then` runs in the node's executor, like any callback. If the job raises an exception,
+        the result is that exception.
         """
         self._work.put((work, then))
 
@@ -72,7 +73,7 @@ class Background:
 
 
 class PlanningThread:
-    """Runs one job at a time in the background, so that a stop does not wait for planning."""
+    """Run one planning job at a time in the background, so that a stop need not wait for it."""
 
     def __init__(self, background: Background, units: JointUnits = TURNING) -> None:
         self._background, self._units = background, units

@@ -76,12 +76,12 @@ class BagRecorder:
         self._write(name_in_bag(EVENTS), 'std_msgs/msg/String', data)
 
     def _write(self, topic: str, type_name: str, data: bytes) -> None:
-        """Write a message with the node's time; earlier ones wait until the node has a time.
+        """Write a serialised message to the bag, stamped with the time of the node's clock.
 
-        A bag that began at time 0 would be as long as the time of the simulation. Nothing is
-        written while the bag is closed. `dropped` counts what finds no room: on the disk (no
-        DiskError is raised), or beyond `MOST_EARLY` waiting messages. ``data``: the serialised
-        message.
+        Before a simulated clock has begun, messages are kept in memory, `MOST_EARLY` at most,
+        and written with the first later one. Nothing is written while the bag is closed.
+        Messages that are lost, for lack of space on the disk or in memory, are counted in
+        `dropped`; no error is raised.
         """
         if self._writer is None:
             return
@@ -110,10 +110,11 @@ class BagRecorder:
     ) -> None:
         """Record `topic`; call `receive` with each decoded message, if given.
 
-        ``kind``: the message's class; ``with_info``: call it with rclpy's info of the message as
-        well. In the bag the topic is named by `name_in_bag`, without namespace and remapping, so
-        that a bag can be replayed in any namespace. A message that cannot be decoded is not
-        recorded: the callback raises InputError, which `RemasterNode` logs.
+        ``kind``: the message's class; ``with_info``: call `receive` with (message, rclpy's
+        message info). In the bag the topic is named by `name_in_bag`, without namespace and
+        remapping, so that a bag can be replayed in any namespace. Without `receive` messages
+        are recorded undecoded. With it a message that cannot be decoded is not recorded: the
+        callback raises InputError, which `RemasterNode` logs.
         """
         module = kind.__module__.split('.')[0]
         type_name = f'{module}/msg/{kind.__name__}'

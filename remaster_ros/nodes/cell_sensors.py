@@ -65,9 +65,9 @@ class CellSensors:
             bag.subscribe(Temperature, topic, recorder.take_temperature)
 
     def _taker(self, recorder: SessionRecorder, sensor: str, marker: str) -> Callable[[Any], None]:
-        """Return the callback for readings of a marker: each goes to `recorder`.
+        """Return the callback for a marker's readings, which calls `recorder.take_marker`.
 
-        One that the recorder accepts shows that the sensor is alive.
+        If that accepts the reading, the sensor counts as alive.
         """
 
         def take(message: PointStamped | PoseStamped) -> None:
@@ -98,17 +98,18 @@ class CellSensors:
         return {name: age_s if np.isfinite(age_s) else None for name, age_s in ages_s.items()}
 
     def trigger(self, pairing: Pairing) -> None:
-        """Send the requests to single-shot sensors that a pairing still needs, except absent ones.
+        """Request measurements that a configuration under way still needs of single-shot sensors.
 
-        Returns at once; to be called until the pairing is decided.
+        Absent sensors are left out. Returns at once; to be called until all sensors of the
+        ``pairing`` (the readings of that configuration) are decided.
         """
         self._shots.look(pairing, self._absent(), self._steady_s())
 
     def give_up(self, recording: Recording) -> None:
-        """Reject what the sensors still owe the pairing under way, if it is overdue.
+        """Reject sensors whose readings of the configuration under way are overdue.
 
-        See `Pairing.give_up`: absent sensors that are required are waited for. Nothing without a
-        pairing.
+        Required sensors that are absent are waited for, see `Pairing.give_up`. Nothing if no
+        configuration is being read.
         """
         recording.give_up(self._absent(), self._liveness.reports)
 

@@ -78,7 +78,7 @@ SAME_WORDS_S = 1.0
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the compensator."""
+    """ROS parameters of the compensator."""
 
     compensation: str = parameter(
         '',
@@ -121,7 +121,7 @@ class Parameters:
 
 @dataclass(eq=False)
 class _Goal:
-    """A client's goal, with the goal sent to the controller for it and whether it has ended."""
+    """A client's action goal, the goal sent to the controller for it, and whether it has ended."""
 
     handle: Any
     sent: Any = None
@@ -219,17 +219,19 @@ class CompensatorNode(RemasterNode):
     def _read(self) -> Any:
         """Read the correction in use from the file of the parameter `compensation`.
 
-        Raises InputError: no such file, a joint slides, or a change above `max_change_deg`.
+        Raises InputError: no such file or not a valid one, a joint slides, or the correction
+        would change a joint by over `max_change_deg` somewhere in its range.
         """
         from remaster_ros.compensation.in_use import CorrectionInUse
 
         return CorrectionInUse(self.p.compensation, most_deg=self.p.max_change_deg)
 
     def on_fault(self, error: Exception) -> None:
-        """Halt after a fault of this program: cancel goals, pass nothing on until ~/enable.
+        """Halt after a fault of this program: cancel goals, refuse trajectories until ~/enable.
 
-        An arm that moves is braked by a trajectory of the gate, on the controller's topic. The
-        fault is logged as in `RemasterNode.on_fault`.
+        If the arm moves, a braking trajectory is published on the controller's topic. The
+        fault is logged as in `RemasterNode.on_fault`. Nothing but that during the node's
+        construction.
         """
         super().on_fault(error)
         if not hasattr(self, '_steady'):
@@ -252,14 +254,16 @@ class CompensatorNode(RemasterNode):
     # Whether it may pass anything on
 
     def _on_description(self, message: String) -> None:
-        """Keep the published robot description, and how it contradicts the correction."""
+        """Keep the published robot description, and whether it goes with the correction."""
         self._description = message.data
         self._described = self._described_trouble()
 
     def _described_trouble(self) -> str:
-        """Return the contradiction of robot description and correction; '' if there is none.
+        """Sentence on why the robot description does not go with the correction; '' if it does.
 
-        Also if nobody has published one, or if it holds the correction already (`NEARER`).
+        Reasons: none was published; it contains this correction already (its axes are far
+        nearer to those of the corrected arm than to the nominal ones, `NEARER`); or it is of
+        another URDF than the one that the correction was measured with.
         """
         topic = self.resolve_topic_name(DESCRIPTION)
         if self._description is None:
@@ -281,11 +285,12 @@ class CompensatorNode(RemasterNode):
         )
 
     def _trouble(self) -> str:
-        """Return why no trajectory is passed on, or ''.
+        """Return why trajectories are refused at present; '' if they are not.
 
-        In this order: a halt; a chained compensator; no fresh joint states
-        (`ArmReports.is_fresh`); a temperature older than `WARM_S`; then description, other
-        publishers of joints or commands, and an arm that is elsewhere (`_misled`).
+        In this order: a halt; a controller that is itself a compensator; no fresh joint states
+        (`ArmReports.is_fresh`); a temperature older than `WARM_S`; no time; the robot
+        description; other publishers of joints or commands; an arm that is elsewhere
+        (`_misled`).
         """
         topic = self.resolve_topic_name(JOINTS)
         if self._halted:
@@ -313,11 +318,11 @@ class CompensatorNode(RemasterNode):
         )
 
     def _misled(self) -> str:
-        """Return in words that the arm is not where it was led, on its path or at the end; ''.
+        """Sentence that the arm is not reported where it was led to; '' if it is.
 
-        Up to `STOPPED_S` after the trajectory's end the reported joints have to be within
-        `ON_PATH_RAD` of a place of it that the arm may lag at; later, or with no trajectory passed
-        on, `LedLast` decides.
+        Until `STOPPED_S` after the end of the last trajectory passed on, the reported joints
+        have to be within `ON_PATH_RAD` of where that trajectory is now or was within the
+        allowed lag. Later, or if none was passed on, `LedLast.elsewhere` decides.
         """
         q, since_s = self._present.q, self.now_s() - self._begun_s
         passed = self._passed
@@ -329,10 +334,10 @@ class CompensatorNode(RemasterNode):
         return self._led.elsewhere(q)
 
     def _moves(self) -> str:
-        """Return that the arm moves, is about to, or is not reported; '' if it stands.
+        """Return why the arm does not count as standing; '' if it stands.
 
-        It stands after `following.STANDING_S` without motion (`ArmReports.stands`), with no
-        trajectory under way.
+        Reasons: no fresh joint states, motion within the last `following.STANDING_S`
+        (`ArmReports.stands`), or a trajectory passed on that has not ended.
         """
         if not self._present.is_fresh(time.monotonic()):
             return f'{self.resolve_topic_name(JOINTS)} does not come'
@@ -342,9 +347,10 @@ class CompensatorNode(RemasterNode):
         return f'a trajectory is under way for {left_s:.1f} s more' if left_s > 0.0 else ''
 
     def _look(self) -> None:
-        """Switch on once the arm stands without trouble; end goals whose controller has gone.
+        """Switch the correction on once the arm stands without trouble; publish the state.
 
-        Timer callback, every `WATCH_S`. It switches on by itself only before the first switch.
+        Timer callback, every `WATCH_S`. It switches on by itself only if nobody has switched
+        it before. Goals end as aborted if the controller's action server has gone.
         """
         trouble = self._trouble()
         if self._on is None and not (trouble or self._moves()):
@@ -356,12 +362,13 @@ class CompensatorNode(RemasterNode):
                 self._end(goal, GoalStatus.STATUS_ABORTED, self._refused(why))
 
     def _switch(self, on: bool, request: Trigger.Request, response: Trigger.Response) -> Any:
-        """Serve a request to switch the correction on (read anew) or off.
+        """Serve a request to switch the correction on (its file is read anew) or off.
 
-        Refused, with the reason in the response, while the arm moves or is not reported; on also
-        if it is elsewhere and not confirmed (`LedLast.confirm`), or the file is invalid, of other
-        joints, or contradicts the description. Switching on ends a halt; if it is refused, the
-        correction before remains.
+        Refused, with the reason in the response, while the arm moves or is not reported. On is
+        also refused if the arm is not where it was led to and this has not been confirmed by a
+        second call (`LedLast.confirm`), or if the file is invalid, of other joints, or
+        contradicts the robot description; the correction before remains then. Switching on
+        ends a halt.
         """
         why = self._moves()
         if on and not why and self._led.elsewhere(self._present.q):
@@ -389,9 +396,10 @@ class CompensatorNode(RemasterNode):
         return response
 
     def _turn(self, on: bool) -> str:
-        """Switch the correction on or off; log and return a sentence on the one in use.
+        """Switch the correction on or off; log and return a sentence with its file and state.
 
-        Makes a new motion gate and new true angles, and outdates a trajectory that is worked out.
+        The motion gate and the true joint angles are made anew; a trajectory that is still
+        being corrected will not be passed on.
         """
         self._on, self._wanted = on, -1
         self._true = self._motion.TrueAngles(self._correction.compensator)
@@ -408,10 +416,10 @@ class CompensatorNode(RemasterNode):
         return text
 
     def _tell(self, trouble: str) -> None:
-        """Publish ~/state (JSON, latched) if it has changed; log why nothing is passed on, if so.
+        """Publish ~/state (JSON, latched) if it has changed, and log the reason in it, if any.
 
-        ``trouble``: of `_trouble`. The state has ``correction`` (on or off), ``sha256`` and
-        ``why``.
+        The state has ``correction`` (on or off), ``sha256`` of its file, and ``why``
+        trajectories are refused ('' if they are not). ``trouble``: as returned by `_trouble`.
         """
         state = {
             'correction': 'on' if self._on else 'off',
@@ -426,7 +434,7 @@ class CompensatorNode(RemasterNode):
                 self._say(f'nothing is passed on: {state["why"]}')
 
     def _say(self, words: str) -> None:
-        """Log an error; the same words in succession once in `SAME_WORDS_S`."""
+        """Log an error; one that repeats the last one only if `SAME_WORDS_S` have passed."""
         now = time.monotonic()
         if now - self._said.get(words, -np.inf) >= SAME_WORDS_S:
             self._said = {words: now}
@@ -441,7 +449,7 @@ class CompensatorNode(RemasterNode):
 
     @property
     def _warm(self) -> float | None:
-        """Temperature to correct with, °C; None if none is needed, or none has come."""
+        """Temperature to correct with, °C; None if the correction needs none or none has come."""
         return self._temperature_c if self._correction.compensator.model.grows else None
 
     def _on_joint_state(self, message: JointState, info: Any) -> None:
@@ -485,12 +493,12 @@ class CompensatorNode(RemasterNode):
         pass_on: Callable[[JointTrajectory], None],
         refuse: Callable[[str], None],
     ) -> None:
-        """Correct a planner's trajectory in the background, and pass on the result or refuse it.
+        """Correct a planner's trajectory in the background; then pass it on, or refuse it.
 
-        ``pass_on``: called with the corrected message; ``refuse``: called with the reason, at once
-        if `_trouble` or its stamp (other than 0, and more than `NOW_S` from now) forbids it. In
-        the background, since it takes a second for ten thousand points. A trajectory that comes
-        meanwhile takes its place; an empty one, which lets the controller hold the arm, is done at
+        ``pass_on``: called with the corrected message; ``refuse``: called with the reason. It
+        is refused at once if `_trouble` has a reason, before the first switch, or if its stamp
+        is neither 0 nor within `NOW_S` of now. A newer trajectory replaces one that is still
+        being corrected. An empty one, which lets the controller hold the arm, is passed on at
         once.
         """
         number = self._wanted = next(self._numbers)
@@ -564,11 +572,12 @@ class CompensatorNode(RemasterNode):
         return passed, self._message(passed.admitted)
 
     def _outdated(self, number: int, arm: Any, found: Any) -> str:
-        """Return why a corrected trajectory is not passed on after all; '' if it is.
+        """Return why a trajectory is not passed on although it was worked out; '' if it is.
 
-        ``number``: of the trajectory; ``arm``: reports it was corrected for; ``found``: result or
-        exception. Reasons: a newer trajectory, a trouble since, an arm that stood and has moved by
-        more than `START_RAD`, one on its way for which the gate refuses it now.
+        Reasons: a newer trajectory; a trouble now; the arm stood and has moved by more than
+        `START_RAD` since; the arm moves, and the motion gate refuses the trajectory from where
+        it is now. ``number``: of the trajectory; ``arm``: reports that it was corrected for;
+        ``found``: result of `_work_out`, or its exception.
         """
         if number != self._wanted:
             return 'another trajectory has come since'
@@ -592,9 +601,10 @@ class CompensatorNode(RemasterNode):
         return ''
 
     def _note_led(self, passed: Any) -> None:
-        """Keep the trajectory that was passed on, its times, and where it leads the arm.
+        """Keep a trajectory that was passed on, its begin and end time, and its last position.
 
-        An empty one leads nowhere: the controller holds the arm (`_note_held`).
+        ``passed``: `SentTrajectory`. An empty one leads nowhere: the controller holds the arm
+        (`_note_held`).
         """
         self._true.lead(passed)
         if not passed.admitted.waypoints:
@@ -605,10 +615,10 @@ class CompensatorNode(RemasterNode):
         self._keep(passed.admitted.waypoints[-1].q)
 
     def _note_held(self) -> None:
-        """Note that the controller holds the arm somewhere along the trajectory passed on.
+        """Note that the controller holds the arm somewhere along the trajectory passed on last.
 
-        The places it may be at are those within the allowed lag of now; no trajectory is under way
-        then.
+        All places of the trajectory within the allowed lag before and after now are kept as
+        possible. No trajectory counts as under way any more.
         """
         passed, since_s = self._passed, self.now_s() - self._begun_s
         if passed is not None and passed.admitted.waypoints and since_s < passed.end_s:
@@ -617,10 +627,10 @@ class CompensatorNode(RemasterNode):
         self._passed, self._end_s = None, self.now_s()
 
     def _keep(self, *samples: FloatArray) -> None:
-        """Note where the arm is led to; write the last sample to the command file.
+        """Keep the positions that the arm is led to; write the last one to the command file.
 
-        ``samples``: configurations on the way, rad, (k,) each. The file is written in the
-        background; not in a simulation.
+        ``samples``: configurations at which the arm may come to rest, rad, (k,) each. The file
+        is written in the background, and not in a simulation.
         """
         self._led.lead_to(*samples)
         if self._keeps_end:
@@ -665,9 +675,10 @@ class CompensatorNode(RemasterNode):
     # The same by the action
 
     def _offer_action(self, controllers: str) -> None:
-        """Offer ~/follow_joint_trajectory, as a client of the action named `controllers`.
+        """Create the action server ~/follow_joint_trajectory and a client of the controller.
 
-        Raises InputError if control_msgs is not installed.
+        ``controllers``: name of the controller's action. Raises InputError if control_msgs is
+        not installed.
         """
         self._action, _ = control_messages()
         self._controllers = self.resolve_topic_name(controllers)
@@ -713,14 +724,15 @@ class CompensatorNode(RemasterNode):
             self._submit(request.trajectory, pass_on, refuse)
 
     def _refused(self, why: str) -> Any:
-        """Return a result of the action with INVALID_GOAL and the reason."""
+        """Return a FollowJointTrajectory result with the error INVALID_GOAL and the reason."""
         return self._action.Result(error_code=self._action.Result.INVALID_GOAL, error_string=why)
 
     def _on_answer(self, goal: _Goal, future: Future) -> None:
-        """Process whether the controller accepts a goal; abort a goal that it refuses.
+        """Process whether the controller has accepted a goal; abort the client's goal if not.
 
-        The newest goal has led the arm nowhere then. One that was cancelled meanwhile is cancelled
-        at the controller. Nothing without a result.
+        A refused goal that is the newest counts as never sent: the arm is where it was led to
+        before. An accepted goal that the client has cancelled meanwhile is cancelled at the
+        controller. Nothing happens if there was no answer.
         """
         if future.cancelled() or future.result() is None:
             return
@@ -758,9 +770,10 @@ class CompensatorNode(RemasterNode):
         goal.handle.publish_feedback(feedback)
 
     def _on_cancel(self, handle: Any) -> CancelResponse:
-        """Cancel a goal at the controller, or while it is worked out; REJECT an unknown goal.
+        """Cancel a goal at the controller, or its correction in the background; return ACCEPT.
 
-        Returns ACCEPT also if the goal is over at the controller by then.
+        ACCEPT also if the controller has ended it, and the result is on its way. REJECT if
+        this node has no such goal any more.
         """
         for goal in self._goals:
             if goal.handle.goal_id == handle.goal_id:
@@ -774,10 +787,10 @@ class CompensatorNode(RemasterNode):
         return CancelResponse.REJECT
 
     def _on_result(self, goal: _Goal, future: Future) -> None:
-        """End a goal as the controller has ended it, with its result; nothing without a result.
+        """End the client's goal with the status and result of the controller.
 
-        If it was the newest, no trajectory is under way; where the arm is held is noted if it
-        failed.
+        If it was the newest goal, no trajectory is under way any more, and if it failed, it is
+        noted where the controller holds the arm. Nothing happens if there is no result.
         """
         if not future.cancelled() and future.result() is not None:
             if goal is self._goals[-1]:

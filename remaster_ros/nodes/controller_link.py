@@ -75,7 +75,7 @@ def action_of(topic: str) -> str:
 
 
 class ForeignGoals:
-    """Watch for goals of other clients of the controller's action than the bridge."""
+    """Watch for goals that other clients than the bridge have sent to the controller's action."""
 
     def __init__(self, node: Node) -> None:
         self.own: set[bytes] = set()
@@ -119,7 +119,7 @@ class ForeignGoals:
 class ControllerStates:
     """Whether the controller publishes its state as joint_trajectory_controller does.
 
-    Of that one, and of what is derived from it, it is known what becomes of a trajectory's stamp.
+    Such a controller is known to keep the time stamps of trajectories.
     """
 
     def __init__(self, node: Node) -> None:
@@ -127,9 +127,9 @@ class ControllerStates:
         self._node, self._topic = node, f'{place}/controller_state'
 
     def is_there(self) -> bool:
-        """Return whether the topic has a publisher of `STATE_TYPE` now.
+        """Return whether the topic controller_state has a publisher of type `STATE_TYPE` now.
 
-        Its type is known without the package of its message.
+        The type is read from the ROS graph: control_msgs need not be installed.
         """
         if not self._node.count_publishers(self._topic):
             return False
@@ -138,7 +138,10 @@ class ControllerStates:
 
 
 def _expiring(profile: QoSProfile) -> QoSProfile:
-    """Return a profile whose messages are given up after `EXPIRES_S`, and else as `profile`."""
+    """Return a QoS profile whose messages expire after `EXPIRES_S` (lifespan).
+
+    Depth, reliability and liveliness are those of `profile`; all else is the default.
+    """
     return QoSProfile(
         depth=profile.depth,
         reliability=profile.reliability,
@@ -149,9 +152,10 @@ def _expiring(profile: QoSProfile) -> QoSProfile:
 
 
 class TopicLink:
-    """Publish the commands on the controller's topic.
+    """Link to the arm's controller by its command topic.
 
-    ``simulated``: in a simulation that waits for its nodes no command is late.
+    ``simulated``: whether a simulation waits for its nodes: then commands do not expire.
+    Attributes: ``missing``: sentence for when no controller listens.
     """
 
     def __init__(self, node: Node, *, simulated: bool = False) -> None:
@@ -193,7 +197,7 @@ class TopicLink:
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal that was sent; `handle` once the controller has accepted it."""
+    """A goal sent to the controller; `handle` is None until the controller has accepted it."""
 
     key: bytes = field(default_factory=lambda: uuid.uuid4().bytes)
     handle: Any = None
@@ -202,11 +206,11 @@ class _Goal:
 
 
 class ActionLink:
-    """Send the commands as goals of FollowJointTrajectory.
+    """Link to the arm's controller by its FollowJointTrajectory action.
 
-    ``rules``: what the arm is judged by here is what the controller is told to keep; ``foreign``:
-    is told which goals are ours; ``failed``: called with the reason where the controller does not
-    take the newest goal, or gives it up.
+    ``rules``: tolerances and timeouts of the supervisor, which the goals state too;
+    ``foreign``: gets the identifiers of the goals sent here; ``failed``: called with the
+    reason if the controller refuses the newest goal, or gives it up.
     Raises InputError: control_msgs is not installed.
     """
 
@@ -306,9 +310,9 @@ class ActionLink:
             goal.cancelled = True
 
     def close(self) -> None:
-        """Wait for the answers, at most `LAST_ANSWER_WALL_S`.
+        """Wait for outstanding answers of the controller, `LAST_ANSWER_WALL_S` at most.
 
-        A stop that is refused is followed by a cancelling.
+        Callbacks run meanwhile: if the controller refuses a stop, all goals are cancelled.
         """
         executor, end = self._node.executor, time.monotonic() + LAST_ANSWER_WALL_S
         while executor is not None and self._awaited and self._node.context.ok():
@@ -317,17 +321,26 @@ class ActionLink:
             executor.spin_once(timeout_sec=0.01)
 
     def _tolerances(self, names: Sequence[str], values: FloatArray) -> list[Any]:
-        """Return tolerance messages of the joints, of position alone; ``values``: rad or m."""
+        """Return a JointTolerance message of each joint, with its position tolerance alone.
+
+        ``names``: joints; ``values``: their tolerances, rad or m, (k,).
+        """
         pairs = zip(names, values, strict=True)
         return [self._tolerance_type(name=name, position=float(value)) for name, value in pairs]
 
     def _await(self, future: Future, done: Callable[[_Goal, Any], None], goal: _Goal) -> None:
-        """Call `done` with the goal and the answer when it comes; `close` waits for it."""
+        """Call `done` with the goal and the result of `future` once it is there.
+
+        Until then it counts as outstanding, and `close` waits for it.
+        """
         self._awaited.append(future)
         future.add_done_callback(partial(self._take, done, goal))
 
     def _take(self, done: Callable[[_Goal, Any], None], goal: _Goal, future: Future) -> None:
-        """Process the answer to a request of a goal; nothing if it was cancelled or is None."""
+        """Call `done` with the goal and the result of `future`, which is no longer outstanding.
+
+        `done` is not called if the future was cancelled or its result is None.
+        """
         self._awaited.remove(future)
         if not future.cancelled() and future.result() is not None:
             done(goal, future.result())
@@ -335,8 +348,8 @@ class ActionLink:
     def _on_answer(self, goal: _Goal, handle: Any) -> None:
         """Process whether the controller accepts a goal; give up the command if it refuses.
 
-        Nothing if a refused goal is of an earlier move. One that was cancelled meanwhile is
-        cancelled now.
+        A refused goal of an earlier move is ignored. An accepted goal that was to be cancelled
+        meanwhile is cancelled now.
         """
         if not handle.accepted:
             if goal in self._goals:

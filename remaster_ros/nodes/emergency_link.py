@@ -17,11 +17,11 @@ PERIODIC = 6
 
 
 class EmergencyLink:
-    """Follow a topic; a link that is silent is trouble.
+    """Subscription to the state of the robot's safety circuit, and whether that has gone silent.
 
-    ``topic``: the topic; '' for no such link; ``on_state``: called with every message's value;
-    ``silence_s``: messages that come regularly and then are silent for so much longer than between
-    them are missed, s of wall time.
+    ``topic``: of std_msgs/Bool; '' for no subscription; ``on_state``: called with the value of
+    every message; ``silence_s``: if messages came regularly, at most this far apart, a silence
+    that is longer than their longest interval by more than this is trouble, s of wall time.
     """
 
     def __init__(
@@ -62,6 +62,6 @@ class EmergencyLink:
         return ''
 
     def _on_message(self, message: Bool) -> None:
-        """Note the time of a message, and hand its value on."""
+        """Keep the wall time of a message, and call `on_state` with its value."""
         self._stamps.append(time.monotonic())
         self._on_state(message.data)

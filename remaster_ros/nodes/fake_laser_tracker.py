@@ -16,7 +16,7 @@ from remaster_ros.simulation.setup import open_world
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the fake laser tracker."""
+    """ROS parameters of the fake laser tracker."""
 
     world: str = parameter('', 'folder of the hidden World; empty for the default one')
     sensor: str = parameter('tracker', "the tracker's name in the World")
@@ -28,7 +28,7 @@ class Parameters:
 
 
 class FakeLaserTrackerNode(RemasterNode):
-    """Serve until stopped."""
+    """Node that runs a fake laser tracker (an emScon server) in a simulated world."""
 
     def __init__(self) -> None:
         super().__init__('fake_laser_tracker')
@@ -54,7 +54,7 @@ class FakeLaserTrackerNode(RemasterNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run(FakeLaserTrackerNode, args)
 
 

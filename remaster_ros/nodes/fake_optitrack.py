@@ -16,7 +16,7 @@ from remaster_ros.simulation.setup import open_world
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the fake OptiTrack server."""
+    """ROS parameters of the fake OptiTrack server."""
 
     world: str = parameter('', 'folder of the hidden World; empty for the default one')
     sensor: str = parameter('mocap', "the bar's name in the World")
@@ -34,7 +34,7 @@ class Parameters:
 
 
 class FakeOptiTrackNode(RemasterNode):
-    """Serve until stopped."""
+    """Node that runs a fake OptiTrack server (NatNet) in a simulated world."""
 
     def __init__(self) -> None:
         super().__init__('fake_optitrack')
@@ -65,7 +65,7 @@ class FakeOptiTrackNode(RemasterNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run(FakeOptiTrackNode, args)
 
 

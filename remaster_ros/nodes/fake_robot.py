@@ -44,7 +44,7 @@ STANDING_CLOCK_WALL_S = 0.1
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the fake arm."""
+    """ROS parameters of the fake arm."""
 
     world: str = parameter(
         '', 'folder of the hidden World; empty: draw one from cell and seed in the default folder'
@@ -67,7 +67,7 @@ class Parameters:
 
 
 class FakeRobotNode(RemasterNode):
-    """The fake arm as ros2_control would run it."""
+    """Node of a simulated arm, with the topics of ros2_control and the simulated clock."""
 
     def __init__(self) -> None:
         super().__init__('fake_robot')
@@ -102,9 +102,10 @@ class FakeRobotNode(RemasterNode):
         self._thread.start()
 
     def _run(self) -> None:
-        """Thread: publish states and the clock, and advance world time; skip what is late.
+        """Thread: publish joint states and clock, and let world time go on, until the node ends.
 
-        The clock is published while it stands too, every `STANDING_CLOCK_WALL_S`.
+        Missed periods are skipped. While world time stands still, the clock is published every
+        `STANDING_CLOCK_WALL_S`.
         """
         state_s, clock_s = 1.0 / self.p.joint_state_rate, self.world.rate / self.p.clock_rate
         state_due = clock_due = self.world.now()
@@ -185,7 +186,7 @@ def _next_due(due: float, period: float, now: float) -> float:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run(FakeRobotNode, args)
 
 

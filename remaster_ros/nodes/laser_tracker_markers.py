@@ -10,7 +10,7 @@ __all__ = ['Parameters', 'main']
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run_sensor('laser_tracker_markers', args, threads=3)
 
 

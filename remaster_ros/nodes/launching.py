@@ -135,10 +135,11 @@ def real_nodes(
 
 
 def _beside(params: str, section: Mapping[str, Any], folders: Mapping[str, str]) -> dict[str, str]:
-    """Return the paths of a section as absolute paths, relative to the folder of the file.
+    """Return path parameters of a node as absolute paths, by the parameter's name.
 
-    ``params``: path of the file; ``folders``: keys of the paths with their defaults; an empty path
-    is left out.
+    Relative paths count from the folder of the parameter file. ``params``: path of that file;
+    ``section``: the node's values there; ``folders``: the path parameters with their defaults;
+    one whose path is empty is left out.
     """
     home = Path(params).resolve().parent
     given = {key: str(section.get(key, default)) for key, default in folders.items()}
@@ -203,10 +204,11 @@ def read_sections(params: str, namespace: str = '') -> dict[str, Mapping[str, An
 
 
 def exit_ends_launch(process: str, returncode: int | None) -> bool:
-    """Return whether a node's exit ends the launch: it is configured wrongly (status `WRONG`).
+    """Return whether the exit of a node's process ends the launch: a status of 2 (`WRONG`).
 
-    ``process``: the executable's name, then a hyphen and a number. The live page, which the others
-    do not need, ends nobody.
+    With that status the node is configured wrongly. ``process``: the executable's name, a
+    hyphen and a number; ``returncode``: exit status, None while it runs. The live page
+    (`PAGE`) never ends the launch, as no other node needs it.
     """
     return returncode == WRONG and process.rpartition('-')[0] != PAGE
 

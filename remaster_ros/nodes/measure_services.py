@@ -26,7 +26,7 @@ MEASURE_EVERY_WALL_S = 5.0
 
 @dataclass
 class _Shot:
-    """A measurement by a service."""
+    """A measurement that a sensor's service is to make, and its request."""
 
     since_wall: float  # When it was first needed
     future: Future | None = None  # Of the request
@@ -34,7 +34,7 @@ class _Shot:
 
 
 class TriggeredSensors:
-    """Requests the measurements of one configuration after the other."""
+    """Measurement requests to single-shot sensors, for one configuration after the other."""
 
     def __init__(self, clients: Mapping[str, Client]) -> None:
         self._clients = clients
@@ -83,7 +83,7 @@ class TriggeredSensors:
 
 
 class MeasureCalls:
-    """Requests measurements until single-shot sensors have seen their markers."""
+    """Measurement requests to single-shot sensors until they have seen their markers."""
 
     def __init__(self, node: Node, cell: Workcell) -> None:
         self._clients: dict[str, Client] = {

@@ -42,7 +42,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class MeasuringNode(RemasterNode):
-    """Node of a sensor that measures; attributes as of `sensor_markers.SensorNode`."""
+    """Base of a sensor's node, as `MeasureService` uses it; attributes as of `SensorNode`."""
 
     kind: str
     sensor: str
@@ -56,7 +56,7 @@ class MeasuringNode(RemasterNode):
 
 
 class MeasureService:
-    """What a node adds for a sensor that measures on request.
+    """Measure service of a sensor's node, with the expected positions of its markers.
 
     ``ending``: set when the node ends.
     Raises InputError: the node listens to the arm's commands under a name by which the bridge
@@ -143,10 +143,10 @@ class MeasureService:
         return transforms.apply(self._T_N_R @ self._T_R_T, self._markers_T[marker])
 
     def step(self) -> None:
-        """Wait half a second for a command of the arm; prepare the driver when it has arrived.
+        """Wait for a command of the arm; prepare the driver when the arm has arrived.
 
-        Returns None: at once without a command, or if the node ends. A DeviceError becomes the
-        node's trouble.
+        Returns None: after half a second without a command, when the driver is prepared, or
+        early if the node ends. A DeviceError of the driver becomes the node's `trouble`.
         """
         if not self._commanded.wait(0.5):
             return
@@ -164,8 +164,10 @@ class MeasureService:
     def _on_measure(self, request: Trigger.Request, response: Trigger.Response) -> Any:
         """Serve a request: measure each marker once; its point is published before the answer.
 
-        It succeeds if any marker was measured and the device is still connected; those that were
-        not are published as NaN. Else the response has the reason, as the node's `trouble` has.
+        Success if any marker was measured and the device is still connected; the other markers
+        are published as NaN then. Otherwise, and without a clock or a ready device, no
+        success, and the response has the reason. Failed measurements are also in the node's
+        `trouble`.
         """
         node = self._node
         if node.clock_trouble:
@@ -198,9 +200,10 @@ class MeasureService:
         return response
 
     def _order(self) -> list[str]:
-        """Return the markers to measure, that of the last reading first.
+        """Return the markers to measure, that of the last reading first; '' is the sensor's first.
 
-        [''], which leaves the choice to the driver, before registration or joint states.
+        [''] alone if no position can be expected yet (before registration, or before the arm's
+        pose is known): the driver finds a marker by itself then.
         """
         if self._expected() is None:
             return ['']

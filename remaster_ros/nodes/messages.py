@@ -96,12 +96,12 @@ def message_class(type_name: str) -> Any:
 def waypoints_message(
     stop: PoseVisit, joint_names: Sequence[str], header: Header
 ) -> JointTrajectory:
-    """Return remaster/joint_waypoints of a stop.
+    """Return the message remaster/joint_waypoints with the paths of a pose visit.
 
-    The configurations to go through before each solution, in order; ``time_from_start.sec`` is 1
-    + the index of the solution they lead to, as in joint_solutions; ``nanosec`` is 0 for a corner
-    of straight lines, and 1 + `SHARES` times the share of a curve. Empty where all ways are
-    straight.
+    It has the configurations to go through before each joint solution, in order;
+    ``time_from_start.sec`` is 1 + the index of the solution they lead to, as in
+    joint_solutions; ``nanosec`` is 0 for a corner of straight lines, and 1 + `SHARES` times
+    the share for a point of a curve. No points if all paths are straight lines.
     """
     message = JointTrajectory(joint_names=list(joint_names))
     message.header = header
@@ -117,10 +117,11 @@ def waypoints_message(
 
 
 def curves_by_solution(message: JointTrajectory) -> dict[int, FloatArray]:
-    """Return the shares of the curves of remaster/joint_waypoints by the solution's index.
+    """Return the shares of the curves in a message remaster/joint_waypoints, by solution.
 
-    Solution, from 0 -> share of each of its waypoints, (n,), n >= 2, ascending from 0 to below 1;
-    solutions that are reached by straight lines are left out. Raises InputError for others.
+    Index of the solution, from 0 -> share of the curve at each of its waypoints, (n,), n >= 2,
+    ascending from 0 to below 1; solutions reached by straight lines are left out. Raises
+    InputError for other shares.
     """
     marks: dict[int, list[int]] = {}
     for point in message.points:

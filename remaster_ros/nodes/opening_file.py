@@ -15,7 +15,10 @@ def page_name(domain: int, node: str) -> str:
 
 
 def opening_path(name: str) -> Path:
-    """Return the file that leads to the page `name`. Raises as `runtime_folder`."""
+    """Return the path of the HTML file that leads to the live page `name` (of `page_name`).
+
+    Raises as `runtime_folder`.
+    """
     return runtime_folder() / f'{name}.html'
 
 

@@ -51,7 +51,7 @@ from remaster_ros.types import FloatArray, Priors
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the optimizer."""
+    """ROS parameters of the optimizer."""
 
     session: str = parameter('session', 'folder of the session to fit')
     out: str = parameter('fit', 'folder for fit.json, figures and report')
@@ -119,10 +119,10 @@ class Optimizer(RemasterNode):
         request: Trigger.Request,
         response: Trigger.Response,
     ) -> Any:
-        """Do a job for a service, one at a time; its error becomes the response's message.
+        """Serve a request by a fit or a search; an error becomes the response's message.
 
-        ``work``: returns the file to open, the response's message, and the text for the status.
-        While another job runs, the request is refused.
+        ``work``: does it, and returns the path of the report, which is the response's message
+        on success, and the text for the node's status. Refused while another one is under way.
         """
         if not self._busy.acquire(blocking=False):
             response.message = 'a fit is under way'
@@ -139,11 +139,11 @@ class Optimizer(RemasterNode):
         return response
 
     def _fit(self) -> tuple[Path, str]:
-        """Fit the session, save the result, publish the offsets; return report and text.
+        """Fit the session, save the result, publish the offsets.
 
-        The report is the path of the file to open; what is implausible in the result is logged and
-        in the text. Raises RemasterError: the session, the priors or the folder cannot be used, or
-        the data do not allow a fit.
+        Returns the path of the file to open and a text for the status, with what is
+        implausible in the result; that is logged too. Raises RemasterError: the session, the
+        priors or the folder cannot be used, or the data do not allow a fit.
         """
         out = Path(self.p.out)
         session = read_session(self.p.session)
@@ -251,7 +251,7 @@ class Optimizer(RemasterNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal ends it or it cannot start; return its exit status."""
     # One for a fit, one for looks while measurements come in, one for the status.
     return run(Optimizer, args, threads=3)
 

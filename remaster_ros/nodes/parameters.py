@@ -34,13 +34,14 @@ _ALWAYS = ('use_sim_time', 'start_type_description_service')
 
 
 def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = None) -> T:
-    """Declare the fields of `kind` on `node` and return their values.
+    """Declare the fields of `kind` as parameters of `node`; return an instance with their values.
 
     ``on_change``: called with all parameters when live ones are to change, in an executor's
-    thread; from its return on the new ones hold. `InputError` refuses the change, with its text as
-    the reason. None: all are read-only.
+    thread; the new ones hold from its return on. If it raises InputError, the change is
+    refused, with its text as the reason. None: all are read-only.
 
-    Raises InputError: naming the node, the parameter and what it may be.
+    Raises InputError for an unknown parameter or an invalid value; it names the node, the
+    parameter and what is allowed.
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
     fields = parameter_fields(kind)

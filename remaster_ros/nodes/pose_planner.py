@@ -76,7 +76,7 @@ RETRY_WALL_S = 1.0
 
 
 class PosePlanner(RemasterNode):
-    """The node; see the module."""
+    """Node that plans poses in front of the sensors and publishes them one by one."""
 
     def __init__(self) -> None:
         super().__init__('pose_planner')
@@ -150,9 +150,10 @@ class PosePlanner(RemasterNode):
         self.get_logger().warning(f'{journal.path}: going on; {self.progress.describe()}')
 
     def _resume_run(self) -> None:
-        """Resume the run of a killed planner, if it certainly still lives; wait until known.
+        """Resume the run of a killed planner if it is certainly still under way.
 
-        If it does not live, the run remains paused, and a warning says why.
+        Called again until that is known, see `CollectionRun.take_up`. If it is not under way,
+        the planner waits for /remaster/collect, and a warning says why.
         """
         token, peers = self.run.left, self._peers
         silent_s, progress = silence_s(token), self.progress.describe()
@@ -167,7 +168,10 @@ class PosePlanner(RemasterNode):
             self.get_logger().warning(self.run.why)
 
     def _follow_run(self) -> None:
-        """Publish the run's state, and keep its liveness file; called with the lock held."""
+        """Publish the run's state; begin or end its liveness file if the run's token has changed.
+
+        To be called with the lock held.
+        """
         # First, since a pause or stop must not wait for the disk.
         self.status.publish()
         living, token = self._living, self.run.token
@@ -179,9 +183,10 @@ class PosePlanner(RemasterNode):
         self._living = living
 
     def _end(self, state: str, why: str = '') -> None:
-        """End the run under way in `state`, and publish that; `_step` writes it to the journal.
+        """End the run under way with `state`, and publish that; `_step` writes it to the journal.
 
-        Nothing if no run is running. ``why``: shown to people.
+        Nothing if no run is running. ``state``: such as paused or failed; ``why``: shown to
+        people.
         """
         with self._lock:
             if self.run.end(state, why, only_from='running'):
@@ -309,7 +314,7 @@ class PosePlanner(RemasterNode):
         return response
 
     def _listen_to_the_arm(self) -> Subscription:
-        """Subscribe to the joint states."""
+        """Subscribe to joint_states, and return the subscription."""
         return self.create_subscription(
             JointState, 'joint_states', self._on_joint_state, JOINT_STATES
         )
@@ -331,9 +336,10 @@ class PosePlanner(RemasterNode):
             self._joint_states = None
 
     def _on_settled(self, message: JointState) -> None:
-        """Set the arm's configuration, the wanted one if the bridge corrects.
+        """Set the arm's configuration from a message, rad or m.
 
-        An invalid message leaves it as it is; `run.why` tells what is wrong.
+        It is the wanted one, before correction, if the bridge corrects. An invalid message
+        changes nothing but `run.why`, which says what is wrong.
         """
         try:
             # The nominal joint angles of the tool's pose, if the bridge corrects.
@@ -561,7 +567,7 @@ class PosePlanner(RemasterNode):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     # Threads for the tour, for pause and stop, and for the status.
     return run(PosePlanner, args, threads=3)
 

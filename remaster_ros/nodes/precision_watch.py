@@ -36,7 +36,11 @@ from remaster_ros.types import Priors
 
 
 class PrecisionWatch:
-    """Fits the session after every `every` configurations (0: never); publishes its precision."""
+    """Fits the session after every `every` configurations, and publishes its precision.
+
+    ``every``: 0 for never; ``goal``: precision that is enough; ``priors``: reads the priors.
+    Attributes: ``state``: the last result, for the optimizer's state.
+    """
 
     def __init__(
         self,
@@ -69,10 +73,11 @@ class PrecisionWatch:
                 self._planned = planned
 
     def _step(self) -> None:
-        """Look at the precision once there are new observations; errors become the state's text.
+        """Fit the session if there are new observations; the text of an error goes to `state`.
 
-        Timer callback. Nothing without a plan, for another session than the recorder's, or once
-        the goal is reached; another plan begins anew. A fault of this program is only logged.
+        Timer callback. Nothing without a plan, for another session than the recorder's, or
+        once the goal is reached; another plan begins anew. A fault of this program is only
+        logged.
         """
         recorder, planned = self._recorder, self._planned
         if recorder is None or not (planned and recorder.plan and recorder.observations):

@@ -57,7 +57,7 @@ from remaster_ros.types import FloatArray
 
 
 class Recorder(RemasterNode):
-    """The node; see the module."""
+    """Node that pairs settled joints with marker readings, and writes the session and the bag."""
 
     def __init__(self) -> None:
         super().__init__('recorder')
@@ -117,10 +117,10 @@ class Recorder(RemasterNode):
             self.recorder.take_joints(message)
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Count the record, and hand an event or state of another node on.
+        """Count a record, and pass an event or state of another node on.
 
-        A sensor's report goes to `sensors`, all others to the session recorder; records of this
-        start of the node are left out.
+        A sensor's report goes to `sensors`, all others to the session recorder. Records that
+        this node has published since its start are only counted.
         """
         self._records[taken_key(record)] += 1
         if isinstance(record.body, events.SensorReport):
@@ -240,7 +240,7 @@ class Recorder(RemasterNode):
 
 
 class _Outlet(Outlet):
-    """Publishes on behalf of the session recorder."""
+    """Output of the session recorder: publishes its events, states and registrations."""
 
     def __init__(self, node: Recorder) -> None:
         self._node = node
@@ -286,7 +286,7 @@ class _Outlet(Outlet):
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run(Recorder, args)
 
 

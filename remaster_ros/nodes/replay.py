@@ -79,7 +79,7 @@ LOOK_S = 1.0
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the replay."""
+    """ROS parameters of the replay."""
 
     bag: str = parameter('', 'folder of the bag, or of the session that holds it')
     rate: float = parameter(1.0, 'how many times as fast as recorded', low=0.01, high=100.0)
@@ -94,7 +94,7 @@ class Parameters:
 
 
 class Replay(RemasterNode):
-    """Replay a bag, as in the module's docstring; the node ends after the last message."""
+    """Node that publishes a bag again in its own time, and ends after the last message."""
 
     def __init__(self) -> None:
         super().__init__('replay')
@@ -128,10 +128,11 @@ class Replay(RemasterNode):
         self._thread.start()
 
     def _publisher(self, topic: str, type_name: str) -> Publisher:
-        """Return a publisher of a topic that was recorded under this name.
+        """Return a publisher for the messages of a recorded topic.
 
-        Its name is relative, for any namespace. Reliable, and latched if the topic is in
-        `LATCHED_TOPICS`. Raises InputError if the message type is not installed.
+        ``topic``: name on the live graph, without namespace; the publisher's is relative, for
+        any namespace. Reliable, and latched if the topic is in `LATCHED_TOPICS`. Raises
+        InputError if the message type is not installed.
         """
         latched = topic in LATCHED_TOPICS
         qos = QoSProfile(
@@ -177,9 +178,11 @@ class Replay(RemasterNode):
         self._ending.wait(DISCOVERY_S)
 
     def _refuse_live(self) -> None:
-        """Check that no arm is in this graph, which the replay could move.
+        """Raise InputError if this ROS graph has a live arm or planner, which it might disturb.
 
-        Raises InputError: naming the node. One that was killed stays listed for some 20 s.
+        That is: another node publishes on a topic of `SOURCES`, or a node that publishes no
+        status of this package subscribes to the commands. The error names the node. A node
+        that was killed stays listed for some 20 s.
         """
         own_node = self.get_name(), self.get_namespace()
         for topic in SOURCES:
@@ -318,10 +321,11 @@ class Replay(RemasterNode):
 
 
 class Acknowledged:
-    """Messages that a recorder has taken of those sent, as it answers; {} without a recorder.
+    """Number of messages sent by a replay that the recorder has not taken yet, by its service.
 
     ``node``: the replay, which is spun by another thread than the one that waits here.
-    Attributes: ``sent``: messages sent by topic, and on remaster/events by `taken_key`.
+    Attributes: ``sent``: messages sent since the last wait, by topic, and on remaster/events
+    by `taken_key`.
     """
 
     def __init__(self, node: RemasterNode) -> None:
@@ -330,10 +334,10 @@ class Acknowledged:
         self._before: dict[str, int] | None = None
 
     def begin(self, wait_s: float, ending: threading.Event) -> None:
-        """Detect a recorder, and note how many messages it has taken already.
+        """Detect a recorder, and keep how many messages it has taken already.
 
-        Nothing if no node of that name subscribes to remaster/settled. ``ending``: set when the
-        node ends. Raises InputError: it is there and its service is not within `wait_s`.
+        Nothing if no node named recorder subscribes to remaster/settled. ``ending``: set when
+        the node ends. Raises InputError if that recorder has no such service within `wait_s`.
         """
         settled = self._node.resolve_topic_name(IN_ORDER[0].lstrip('/'))
         subscribers = self._node.get_subscriptions_info_by_topic(settled)
@@ -422,7 +426,7 @@ def _live(info: TopicEndpointInfo, does: str) -> str:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until the end of the bag, a signal or an error; return its exit status."""
     return run(Replay, args)
 
 

@@ -30,7 +30,7 @@ COUNT_WALL_S = 3.0
 
 
 class OnlyPublisher:
-    """Check that a topic has at most `allowed` publishers: one, or none."""
+    """Check that a topic has at most `allowed` publishers (1 or 0), leaving out killed ones."""
 
     def __init__(self, node: Node, topic: str, message_type: Any, allowed: int = 1) -> None:
         self._node, self._type, self._allowed = node, message_type, allowed
@@ -41,10 +41,11 @@ class OnlyPublisher:
         self._alive = 0
 
     def trouble(self) -> str:
-        """Return a sentence on the topic's publishers if they are too many; '' if not.
+        """Sentence on the topic's publishers if there are more than allowed; '' if not.
 
-        With publishers without a lease all listed count at once. If all have one, those that are
-        alive count, and '' is returned until `COUNT_WALL_S` after several were first listed.
+        If any listed publisher has no liveliness lease, all that are listed count, at once. If
+        all have one, those whose lease is alive count, and '' is returned for the first
+        `COUNT_WALL_S` after too many were listed.
         """
         if self._node.count_publishers(self._topic) <= self._allowed:
             self._several_wall = None

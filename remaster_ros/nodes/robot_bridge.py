@@ -114,7 +114,7 @@ WATCH_WALL_S = 0.05
 
 @dataclass(frozen=True)
 class Parameters(SimulationParameters):
-    """Parameters of the bridge."""
+    """ROS parameters of the robot bridge."""
 
     cell: str = parameter('', 'cell file: a path, or the name of a shipped one; must be given')
     speed_share: float = parameter(
@@ -426,9 +426,10 @@ class RobotBridge(RemasterNode):
             )
 
     def _on_parameters(self, p: Parameters) -> None:
-        """Use other speed limits, from now on; a move under way is stopped and goes on with them.
+        """Use new speed limits from now on; a move under way is stopped and goes on with them.
 
-        Raises InputError if one is raised while a collection runs.
+        ``p``: all parameters, with the new limits. Raises InputError if a limit is raised
+        while a collection runs.
         """
         raised = p.raised_from(self.p)
         if raised and self.supervisor.under_way:
@@ -469,7 +470,11 @@ class RobotBridge(RemasterNode):
     # What comes in
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Tell the supervisor of states of planner and recorder, and of recorder's answers."""
+        """Pass the states of planner and recorder on to the supervisor.
+
+        Also the end of a configuration of the present pose, the recorder's answer; all else is
+        ignored, but for the arm model that every record states.
+        """
         now = self.steady_s()
         self._models.take(record, now)
         match record.body:
@@ -486,7 +491,7 @@ class RobotBridge(RemasterNode):
                 self._do(self.supervisor.answered(solution, now))
 
     def _on_description(self, message: String) -> None:
-        """Keep how a published robot description contradicts the URDF of the cell; '' if not."""
+        """Keep a sentence on how the robot description contradicts the cell's URDF; '' if not."""
         why = difference(self.chain, message.data)
         self._described = why and (
             f'{self.resolve_topic_name(DESCRIPTION)} is not the URDF of the cell, '
@@ -556,9 +561,10 @@ class RobotBridge(RemasterNode):
         self._taken.take(message.header.stamp)
 
     def _take_report(self, message: JointState, info: Mapping[str, Any]) -> None:
-        """Give joint states to the supervisor; doubt those that are invalid or of a rival.
+        """Pass the arm's joint positions on to the supervisor, or why a message has none.
 
-        Without a time of the node's clock they are left out.
+        Instead of positions it is told: that there is no time, that the message is invalid,
+        has no joint of the arm, or that several publishers send the arm's joints.
         """
         now = self.steady_s()
         if self.clock_trouble:
@@ -597,9 +603,10 @@ class RobotBridge(RemasterNode):
         return response
 
     def _watch(self) -> None:
-        """Tell the supervisor of rivals, model, controller, clock and safety, each trouble or ''.
+        """Tell the supervisor the present trouble, or '', of each thing that can block the arm.
 
-        Timer callback, every `WATCH_WALL_S`.
+        These are rivals (other publishers), arm model, controller, clock and safety circuit;
+        also whether the controller keeps stamps. Timer callback, every `WATCH_WALL_S`.
         """
         now = self.steady_s()
         troubles = (only.trouble() for only in self._only)
@@ -782,9 +789,10 @@ class RobotBridge(RemasterNode):
         self._controller.send(message, kind)
 
     def _on_commanded(self, drive: Drive) -> None:
-        """Count and publish a move to a solution; log a probe longer than `PROBE_S`.
+        """Count a move to a solution, and publish its event; log a probe longer than `PROBE_S`.
 
-        Other moves than those to a solution (`solution` < 0) are not counted.
+        A probe leads the arm to where it is reported. Moves that are not to a solution
+        (`solution` < 0) are not counted. ``drive``: the move, which has been sent.
         """
         solution, duration_s = drive.solution, drive.admitted.waypoints[-1].time_s
         if solution == PROBE and duration_s > PROBE_S:
@@ -819,9 +827,10 @@ class RobotBridge(RemasterNode):
             self.get_logger().error(f'{self._halt_file.path}: the halt is not kept ({result})')
 
     def _announce(self, settled: Settled) -> None:
-        """Publish where the arm has settled, with wanted positions if a correction is on.
+        """Publish where the arm has settled: remaster/settled and an event.
 
-        Wanted are the commanded positions without the correction's change, named with `WANTED`.
+        With a correction on, the message also has the wanted positions, named with `WANTED`:
+        the settled ones less the change that the correction has made.
         """
         self._settled_wall = self.steady_s()
         self.counts['settled'] += 1

@@ -76,14 +76,14 @@ class RemasterNode(Node):
     # what the graph shows not to match (`status.mismatches`).
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
-        """As in rclpy, without default event handlers."""
+        """As in rclpy, without default event handlers (which warn of QoS mismatches)."""
         kwargs.setdefault('event_callbacks', PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Subscription:
-        """As in rclpy, without default event handlers.
+        """As in rclpy, without default event handlers (which warn of QoS mismatches).
 
         A message for which the callback raises InputError is dropped, with a line in the log
         (`on_unreadable`).
@@ -97,10 +97,11 @@ class RemasterNode(Node):
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
     ) -> Service:
-        """As in rclpy, but the caller of a Trigger is answered whatever the callback raises.
+        """Create a service as rclpy does; its caller is answered whatever the callback raises.
 
-        rclpy lets an exception out of the callback end the process, and the caller waits for ever.
-        The answer of such a call is that of `failed`: no success, and one line.
+        A Trigger is answered as by `failed` (no success, one line), which gives an error that
+        is no RemasterError to `on_fault`, too: the node may end with it. For other types the
+        error is logged, and the answer is empty or refuses the parameters of the request.
         """
         if srv_type is not Trigger:  # Those of rclpy itself, for parameters.
             callback = _refusing(self, srv_name, callback)
@@ -227,10 +228,11 @@ def _leaving_out(
 
 
 def _refusing(node: RemasterNode, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the callback of a service of rclpy, which refuses a request that it cannot read.
+    """Return a service callback that answers with a refusal if `callback` raises.
 
-    Such as a parameter of a type that does not exist. What is done with the values is in callbacks
-    of this package, which catch what they raise.
+    For rclpy's own services, whose requests may be unreadable, such as a parameter of no known
+    type. The error is logged. The answer is a new one; its results, if it has any, say
+    ``successful`` False with the reason. ``name``: of the service, for the log.
     """
 
     @wraps(callback)
@@ -251,7 +253,7 @@ def _refusing(node: RemasterNode, name: str, callback: Callable[..., Any]) -> Ca
 
 
 class _Takes(Executor):
-    """Takes messages, requests and answers; what cannot be read is a fault of its sender.
+    """Executor mixin that drops messages, requests and answers that rclpy cannot read.
 
     rclpy raises out of its own bookkeeping there, and never takes from that topic again.
     """
@@ -372,8 +374,8 @@ def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:
 def report(error: RemasterError) -> int:
     """Print an error as one line on stderr; return its exit status.
 
-    2 for wrong usage, bad input or a device that does not do its part; 1 where the data do not
-    allow an answer.
+    1 for InsufficientDataError: the data do not allow an answer; 2 for all others, such as
+    wrong usage, bad input or a device that does not do its part.
     """
     print(f'error: {" ".join(str(error).split())}', file=sys.stderr)
     return 1 if isinstance(error, InsufficientDataError) else 2

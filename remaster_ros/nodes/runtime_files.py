@@ -23,12 +23,12 @@ PATIENCE_S = 1.0
 
 
 def runtime_folder() -> Path:
-    """Return this user's folder of locks; made where there is none, readable by no other user.
+    """Return this user's folder for locks and other runtime files; made if missing, mode 700.
 
-    Always below /tmp: XDG_RUNTIME_DIR is set in one shell and not in the other (ssh, services),
-    and two processes must find the same folder.
+    Always below /tmp: XDG_RUNTIME_DIR is set in one shell and not in the other (ssh,
+    services), and two processes must find the same folder.
 
-    Raises InputError: it belongs to another user, or cannot be made.
+    Raises InputError: it belongs to another user, is open to others, or cannot be made.
     """
     folder = Path('/tmp') / f'remaster_ros_{os.getuid()}'
     try:

@@ -78,10 +78,11 @@ class RvizMarkers:
         return bool(self._publisher.get_subscription_count())
 
     def publish(self, scene: Mapping[str, Any]) -> None:
-        """Publish the markers of a `LiveView.view(…)['scene']`, with one stamp of now.
+        """Publish the markers of a scene, all with the present time as their stamp.
 
-        Without positions of the arm, and without a target, these are left out; empty lists are
-        deleted.
+        ``scene``: that of `LiveView.view`. The arm is left out without its positions, the axes
+        of the target without a target; a path or measured points that are empty are deleted in
+        RViz.
         """
         markers = []
         if scene['q'] is not None:
@@ -118,11 +119,10 @@ class RvizMarkers:
         return markers
 
     def place_sensors(self, T_R_N: Mapping[str, FloatArray]) -> None:
-        """Publish where sensors stand, sensor -> (4, 4), to /tf_static.
+        """Publish the frames of sensors, T_R_N (4, 4) by name, on /tf_static.
 
-        Nothing without tf2_msgs or `publish_tf`. The registration of a sensor on the tool is the
-        frame of the board that it sees, and is called so, as in the transforms that `remaster
-        export --to tf` writes.
+        Nothing without tf2_msgs or `publish_tf`. For a sensor on the tool it is the frame of
+        the board that the sensor sees, and is named so, as `remaster export --to tf` does.
         """
         if self._tf is None:
             return

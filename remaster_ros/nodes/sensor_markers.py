@@ -76,12 +76,12 @@ def subscribe_to_source(node: Node, driver: TopicDriver, sensor: CellSensor) -> 
 class SensorNode(MeasuringNode):
     """Node that publishes the marker positions measured by one of the cell's sensors.
 
-    ``name``: of the node, where none is given on its command line; it chooses the driver, unless
-    it is that of no registered sensor: then the given one does.
-    Attributes: ``kind``: key of the driver in `remaster_ros.sensors.registry.DRIVERS`; ``sensor``:
-    its name in the cell, which is the frame of its readings; ``trouble``: why the device was not
-    opened, or what it refused last; ''; ``in_use``: held while a command of the device is under
-    way.
+    ``name``: of the node, if none is given on its command line. The driver is that of
+    ``name``, or, if no registered sensor has it, that of the name on the command line.
+    Attributes: ``kind``: key of the driver in `remaster_ros.sensors.registry.DRIVERS`;
+    ``sensor``: its name in the cell, which is the frame of its readings; ``trouble``: why the
+    device was not opened, or what it refused last; ''; ``in_use``: lock, held while a command
+    of the device is under way.
     """
 
     def __init__(self, name: str) -> None:
@@ -201,18 +201,16 @@ class SensorNode(MeasuringNode):
             self._ending.wait(RETRY_S)
 
     def _require_start(self, error: RemasterError) -> None:
-        """End the node with this error if the device has not worked within the start time-out.
-
-        Nothing once it has.
-        """
+        """End the node with this error if its start time-out is over before the device worked."""
         over = time.monotonic() > self._start_by
         if over and not (self._started or self._ending.is_set()):
             self.failure = error
 
     def _read(self, driver: StreamDriver) -> float | None:
-        """Publish the next reading of a stream; return when it was received, s, None without one.
+        """Publish the next reading of a stream; return when it was received, s.
 
-        A DeviceError closes the driver, which is opened again after `RETRY_S`.
+        None if there was no reading; without any within the start time-out the node ends.
+        After a DeviceError the driver is closed, to be opened again after `RETRY_S`.
         """
         try:
             reading = driver.read()
@@ -288,14 +286,14 @@ class SensorNode(MeasuringNode):
 def run_sensor(name: str, args: list[str] | None = None, threads: int = 3) -> int:
     """Run the node of a sensor until it ends; return its exit status, see `running.run`.
 
-    ``name``: of the node, which chooses the driver unless one is given in `args`; ``threads``: of
-    its executor.
+    ``name``: default name of the node, by which the driver is chosen, see `SensorNode`;
+    ``args``: command line, None for that of the process; ``threads``: of its executor.
     """
     return run(lambda: SensorNode(name), args, threads=threads)
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal or an error ends it; return its exit status."""
     return run_sensor(GENERIC, args)
 
 

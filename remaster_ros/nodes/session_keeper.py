@@ -22,11 +22,11 @@ CHECK_S = 1.0
 
 
 class SessionKeeper:
-    """Journal and bag of a session, whose writes wait if the disk is full.
+    """Journal and bag of a session; a write that fails for lack of disk space is repeated.
 
     ``began``: first record of a bag; None for no bag.
-    Attributes: ``journal, bag``; ``full``: why a write waits, '' if none does; ``restored``: last
-    damage of the files by others that was repaired, ''.
+    Attributes: ``journal, bag``; ``full``: why a write waits, '' if none does; ``restored``:
+    the last repair of files that others had changed, '' before any.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class SessionKeeper:
             self.full = ''
 
     def look(self) -> bool:
-        """Retry a failed write and repair files that others changed; whether one was repaired.
+        """Retry a failed write and repair files that others changed; return whether any was.
 
-        Writes are repeated every `RETRY_S`, files checked every `CHECK_S`; False in between. To be
-        called often, by a timer.
+        A write is repeated every `RETRY_S`, files are checked every `CHECK_S`; False between
+        two checks. To be called often, by a timer.
         """
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:

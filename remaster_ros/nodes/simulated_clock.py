@@ -97,8 +97,8 @@ class SteadyTime:
 class ReportsTaken:
     """Publishes, in a simulation, up to which stamp a node has processed its messages.
 
-    ``simulated``: `simulated_clock_rate`, or whether the clock is simulated; else nothing is
-    published; ``leads``: whether the node leads the arm.
+    ``simulated``: nothing is published if 0 (or False), as for a `simulated_clock_rate` of 0;
+    ``leads``: whether the node leads the arm.
     """
 
     def __init__(self, node: RemasterNode, simulated: float, *, leads: bool = False) -> None:
@@ -110,11 +110,11 @@ class ReportsTaken:
         self._confirmed_wall = 0.0
 
     def take(self, stamp: Time) -> None:
-        """Confirm that all was taken: up to the report with this stamp, or until this time.
+        """Publish, on `TAKEN`, that all messages up to a stamp have been processed.
 
-        Publishes `TAKEN` at most every `TAKEN_EVERY_S` of stamps, for who leads the arm at every
-        new stamp; a stamp that stands is confirmed again after that in wall time. Nothing without
-        a simulation.
+        At most every `TAKEN_EVERY_S` of stamps; a node that leads the arm, at every new stamp.
+        If the stamp does not change, again after that in wall time. Nothing without a
+        simulation.
         """
         if self._publisher is None:
             return

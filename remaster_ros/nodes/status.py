@@ -74,7 +74,7 @@ LEVELS = {
 
 
 class Summary(NamedTuple):
-    """Present status of a node."""
+    """Present status of a node: level, message, values for people, and state for other nodes."""
 
     level: str  # ``ok``, ``warn`` or ``error``
     message: str  # For people
@@ -127,7 +127,10 @@ class NodeStatus:
 
     @property
     def alone_since(self) -> float | None:
-        """Time since which no other node of this name was found, `time.monotonic`; or None."""
+        """Time since which no other node of this name was heard, `time.monotonic`, s.
+
+        None before this node has received its own first state.
+        """
         return self._duplicates.alone_since_s
 
     def alone(self, now: float) -> bool:
@@ -179,7 +182,7 @@ class NodeStatus:
             self._publish_status(self._publisher, summary)
 
     def event(self, event: Event) -> None:
-        """Publish an event now."""
+        """Publish an event now, on remaster/events."""
         self._publish_record(event)
 
     def _publish_record(self, body: State | Event) -> None:
@@ -235,7 +238,8 @@ class NodeStatus:
 def pairs(state: State) -> dict[str, str]:
     """Return the fields of a state as text for people, name -> text.
 
-    A table becomes one pair ``NAME_KEY`` for each of its entries; nested structures are left out.
+    A dictionary becomes an entry ``NAME_KEY`` for each of its keys; nested structures are left
+    out.
     """
     found = {}
     for name, value in msgspec.structs.asdict(state).items():

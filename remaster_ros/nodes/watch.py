@@ -71,7 +71,7 @@ OTHER_PLAN = 'another plan is next; look again'
 
 @dataclass(frozen=True)
 class Parameters:
-    """Parameters of the live page."""
+    """ROS parameters of the live page."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     fit: str = parameter('fit', "the optimizer's folder: what a fit has brought is read there")
@@ -218,7 +218,7 @@ class Watch(RemasterNode):
             self.view.take_joints(self._q)
 
     def _on_point(self, sensor: str, marker: str, message: PointStamped) -> None:
-        """Give a reading, m, to the residuals on the page."""
+        """Use a sensor's reading of a marker, m, for the residuals on the page."""
         position = np.array([message.point.x, message.point.y, message.point.z])
         self.view.residuals.reading(sensor, marker, position)
 
@@ -251,19 +251,19 @@ class Watch(RemasterNode):
         self._rviz.place_sensors(self.view.registration)
 
     def _on_means(self, message: JointState) -> None:
-        """Keep the offsets of a fit; show them once their deviations are there."""
+        """Keep the offsets of a fit; show them once their standard deviations are there."""
         self._means = message
         self._take_offsets()
 
     def _on_stds(self, message: JointState) -> None:
-        """Keep the deviations of the offsets; show both once the offsets are there."""
+        """Keep the standard deviations of the offsets; show both once the offsets are there."""
         self._stds = message
         self._take_offsets()
 
     def _take_offsets(self) -> None:
         """Show the offsets of a fit when both of its messages (same stamp) are there.
 
-        Further figures are read from its fit.json, in the background.
+        Further facts on the fit are read from its fit.json, in the background.
         """
         means, stds = self._means, self._stds
         if means is None or means.header.stamp != stds.header.stamp:
@@ -275,9 +275,10 @@ class Watch(RemasterNode):
         )
 
     def _on_fit_facts(self, facts: Any) -> None:
-        """Show figures of a fit, unless reading them has failed.
+        """Show further facts of a fit, and use its markers for the live residuals.
 
-        ``facts``: of the reading, or the exception that ended it, which is ignored here.
+        ``facts``: the `FitFacts` read in the background, or the exception that ended the
+        reading, which changes nothing.
         """
         if not isinstance(facts, Exception):
             self.view.take_fit(facts)
@@ -289,10 +290,10 @@ class Watch(RemasterNode):
         return self.create_client(Trigger, f'remaster/{name}')
 
     def _send(self, name: str, done: Done) -> None:
-        """Call a service, and `done` with success and message when it has answered.
+        """Call a service of the page; then call `done` with its success and message.
 
-        In the thread of the page, whose executor this is not. `done` is called at once, without
-        success, if `name` is no service of the page now, or nobody offers it.
+        Called in the thread of the page, which does not wait. `done` is called at once,
+        without success, if `name` is no service of the page now, or no node offers it.
         """
         client = self._callers.get(name)
         if client is None:
@@ -353,11 +354,12 @@ def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
-    """Return figures of a fit.json for the page, besides offsets; empty if there is none.
+    """Return the further facts of a fit for the page, from the fit.json of the optimizer.
 
-    ``folder``: of the optimizer, if it is on this computer; ``offsets``: as published, joint ->
-    rad or m; a file of another fit (an offset differs, `numpy.isclose`) counts as none, as does an
-    invalid one.
+    They are texts by label (mean errors, files), the joints that are not identifiable, and the
+    markers' positions. All are empty if there is no valid fit.json on this computer, or it is
+    of another fit. ``folder``: of the optimizer; ``offsets``: as published, joint -> rad or m,
+    by which the fit is recognised (`numpy.isclose`).
     """
     try:
         fit = read_fit(folder / FIT_FILE)
@@ -383,7 +385,7 @@ def fit_facts(folder: Path, offsets: Mapping[str, float]) -> FitFacts:
 
 
 def main(args: list[str] | None = None) -> int:
-    """Run the node."""
+    """Run the node until a signal ends it or it cannot start; return its exit status."""
     os.nice(NICENESS)
     make: Callable[[], RemasterNode] = Watch
     return run(make, args)

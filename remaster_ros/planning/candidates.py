@@ -66,7 +66,8 @@ class PoseRanges:
     def contain(self, places: FloatArray) -> BoolArray:
         """Whether points (n, 3), m in R, lie in the ranges of cylinder coordinates, (n,).
 
-        Bounds are inside; azimuths count modulo whole turns. The roll is not looked at.
+        These are azimuth, radius and height about the Z axis of the robot base frame R; bounds
+        are inside, azimuths count modulo whole turns. The range of the roll is not used.
         """
         x, y, height = places.T
         # Angle from the lower azimuth, modulo whole turns.
@@ -79,7 +80,7 @@ class PoseRanges:
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """A sensor that has to see a marker at every configuration."""
+    """A sensor that has to see a marker at every configuration, with their positions."""
 
     sensor: str  # Name of the sensor
     sensor_R: FloatArray  # Position of the sensor in R, m, (3,)
@@ -135,7 +136,7 @@ class PlanningScene:
 
     @property
     def rough_R(self) -> dict[str, FloatArray]:
-        """Rough position of each sensor in R, m, (3,)."""
+        """Rough position of each sensor in the robot base frame R, name -> m, (3,)."""
         return {sight.sensor: sight.sensor_R for sight in self.sights}
 
     def plan(
@@ -284,9 +285,10 @@ def plan_poses(
 def _reasons(
     arm: CollisionModel, q: FloatArray, lines_of_sight: Sequence[LineOfSight]
 ) -> np.ndarray[tuple[int], np.dtype[np.str_]]:
-    """Return the first reason to drop each solution (m, k), '' if it is usable, (m,).
+    """Return the first reason to drop each joint solution, '' if it is usable, (m,).
 
-    Collisions (nearer than `RESERVE_M`) come first, then each line of sight in order.
+    Collisions (nearer than the clearance and `RESERVE_M`) come first, then a marker out of
+    sight of each of `lines_of_sight` in order. ``q``: the solutions, rad or m, (m, k).
     """
     # More clearance than the bridge requires: an arm slightly off its path may still move.
     collisions = arm.reasons(q, RESERVE_M)
@@ -296,9 +298,11 @@ def _reasons(
 
 
 def is_hidden(arm: CollisionModel, q: FloatArray, sight: LineOfSight) -> BoolArray:
-    """Whether the marker faces away from the sensor or the arm hides it, (m,).
+    """Whether a marker is hidden from a sensor at configurations q, (m,).
 
-    It faces away beyond `max_angle_rad`. ``q``: rad or m, (m, k).
+    It is if the tool's Z axis is turned from the line to the sensor by more than
+    `max_angle_rad` of ``sight``, or a link or obstacle is in the way (`CollisionModel.hides`).
+    ``q``: rad or m, (m, k).
     """
     T = arm.chain.forward(q)
     to_sensor = sight.sensor_R - arm.chain.positions(q, sight.marker_T)

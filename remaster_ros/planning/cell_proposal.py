@@ -43,7 +43,7 @@ FULL_SIZE_M = 0.9
 
 @dataclass(frozen=True)
 class HeldJoint:
-    """The joint to hold so that poses have joint solutions, and how these are found."""
+    """The joint of a 7-axis arm to hold at fixed values for inverse kinematics, if any."""
 
     joint: int | None  # Its index; None if the arm has at most six joints
     values_held: tuple[float, ...]  # rad or m
@@ -54,22 +54,26 @@ class HeldJoint:
     kinematics: InverseKinematics  # With this joint held
 
     def values(self) -> dict[int, tuple[float, ...]]:
-        """Return the held joint and its values in the form of `InverseKinematics`."""
+        """Return {index of the held joint: its values}, as `InverseKinematics` takes them.
+
+        {} if no joint is held.
+        """
         return {} if self.joint is None else {self.joint: self.values_held}
 
 
 def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
     """Return the joint that gives poses the most joint solutions if it is held.
 
-    None of an arm with `FEWEST_JOINTS` to six joints. A joint that leaves an arm with a closed
-    form, or near one, is preferred: solutions are then found a hundred times as fast, and none is
-    missed. A slide is held at `SHARES` of its travel; another joint at up to three values if its
-    poses have fewer than `FEW_SOLUTIONS`.
+    No joint is held (`HeldJoint.joint` None) if the arm has `FEWEST_JOINTS` to six joints. Of
+    seven, a joint is preferred that leaves an arm with a closed form, or near one: solutions
+    are then found a hundred times as fast, and none is missed. A prismatic joint is held at
+    `SHARES` of its travel; another one at up to three values if poses have fewer than
+    `FEW_SOLUTIONS` on average.
 
     ``facing``: tool poses to try, (n, 4, 4), such as those drawn from `widest_ranges`.
 
-    Raises InputError if the arm has fewer than three or more than seven joints, or is singular at
-    all configurations whichever joint is held.
+    Raises InputError if the arm has fewer than three or more than seven joints, or is singular
+    at all configurations whichever joint is held.
     """
     if FEWEST_JOINTS <= len(chain) <= FREE_JOINTS:
         kinematics = InverseKinematics(chain, {})
@@ -122,10 +126,11 @@ def propose_held_joint(chain: SerialChain, facing: FloatArray) -> HeldJoint:
 
 
 def _resting(chain: SerialChain, joint: int) -> float:
-    """Return a position to hold a joint at, rad or m: 0 if well inside limits, or mid-range.
+    """Return a position to hold a joint at, rad or m.
 
-    Well inside is at least a fifth of the range from both limits; without limits 0; of a slide
-    always the middle. The middle of a joint that turns is rounded to 5 degrees.
+    0 if that is at least a fifth of the range from both limits, or there are no limits; else
+    the middle of the range, rounded to 5 degrees. Of a prismatic joint always the middle, not
+    rounded. ``joint``: its index.
     """
     low, high = chain.lower[joint], chain.upper[joint]
     if chain.slides[joint]:
@@ -138,19 +143,25 @@ def _resting(chain: SerialChain, joint: int) -> float:
 
 
 def _random_joints(chain: SerialChain, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return random configurations within the usual ranges, rad or m, (count, k)."""
+    """Return uniformly random joint positions within the limits, rad or m, (count, k).
+
+    Limits of revolute joints are cut to ±pi (`usual_range`). Collisions are not checked.
+    """
     return rng.uniform(*chain.usual_range, (count, len(chain)))
 
 
 def _mean_solutions(kinematics: InverseKinematics, poses: FloatArray) -> float:
-    """Return the mean number of usable joint solutions of poses (n, 4, 4), n >= 1."""
+    """Return the mean number of usable joint solutions of tool poses (n, 4, 4), n >= 1.
+
+    Unreachable poses count as 0.
+    """
     solutions = kinematics.solutions_of_each(poses)
     return float(np.mean([len(kinematics.usable(q)) for q in solutions]))
 
 
 @dataclass(frozen=True)
 class Reach:
-    """Extent of the workspace of an arm."""
+    """Extent of the workspace of an arm: its radius, and its lowest and highest tool position."""
 
     reach_m: float  # Largest distance of the tool from the first joint's axis, m
     # Lowest and highest tool position, m
@@ -167,9 +178,10 @@ def reach_of(chain: SerialChain, rng: np.random.Generator) -> Reach:
 
 
 def link_radius(reach: Reach, full_size: float) -> float:
-    """Return the radius of an arm's links, m, from that of full-size arms (`FULL_SIZE_M`).
+    """Return a collision radius for an arm's links, m, rounded to mm.
 
-    In proportion to the reach, no larger than `full_size`, rounded to mm.
+    ``full_size``: radius for arms with a reach of `FULL_SIZE_M` or more, m; for smaller arms
+    it is reduced in proportion to the reach.
     """
     return round(full_size * min(reach.reach_m / FULL_SIZE_M, 1.0), 3)
 
@@ -182,9 +194,10 @@ def facing_angle_deg(
 ) -> float:
     """Return the largest angle between tool axis and line to a sensor at usable poses, degrees.
 
-    `max_angle_deg` if at least `FACING` of 3,000 random poses face the sensor within it. Else the
-    arm cannot turn its tool so far, like a SCARA, whose tool stays upright: then an angle, in
-    steps of 5, within which a share `MOST` of its poses face the sensor. ``sensor_R``: m, (3,).
+    `max_angle_deg` if at least `FACING` of 3,000 random poses face the sensor within it. Else
+    the arm cannot turn its tool so far, like a SCARA, whose tool stays upright: then an angle,
+    in steps of 5, at most 180, within which a share `MOST` of its poses face the sensor.
+    ``sensor_R``: its position in the robot base frame R, m, (3,).
     """
     T = chain.forward(_random_joints(chain, 3000, rng))
     to_sensor = sensor_R - T[:, :3, 3]
@@ -210,11 +223,11 @@ def widest_ranges(reach: Reach, floor_z: float | None) -> PoseRanges:
 
 
 def ranges_around(places: FloatArray) -> PoseRanges:
-    """Return ranges around the middle of reachable tool positions, m, (n, 3), n >= 1.
+    """Return ranges for candidate poses around the middle of reachable tool positions.
 
-    Quantiles 0.1 to 0.9 of radius and height, in steps of 1 cm; 0.05 to 0.95 of azimuth, in steps
-    of 5 degrees, or a whole turn if that is wider than 300 degrees. ``places``: of the tool in the
-    base frame.
+    Quantiles 0.1 to 0.9 of radius and height, in steps of 1 cm; 0.05 to 0.95 of azimuth, in
+    steps of 5 degrees, or a whole turn if that is wider than 300 degrees. The roll is any.
+    ``places``: positions of the tool in the base frame, m, (n, 3), n >= 1.
     """
     radius = np.quantile(np.linalg.norm(places[:, :2], axis=1), (0.1, 0.9))
     height = np.quantile(places[:, 2], (0.1, 0.9))
@@ -228,11 +241,12 @@ def ranges_around(places: FloatArray) -> PoseRanges:
 
 
 def marker_height(chain: SerialChain, bodies: Sequence[Body], link_radius: float) -> float:
-    """Return a position on the tool's Z axis at which a marker is clear of the arm, m.
+    """Return a coordinate on the tool's Z axis at which a marker is clear of the arm, m.
 
-    In front of the last link, or negative if Z points back along the arm. `CLEAR_M` from last and
-    previous link, rounded up to cm, at least `LEAST_MARKER_M`. ``bodies``: the collision geometry;
-    ``link_radius``: of the links in the line of sight, m.
+    Positive in front of the last link; negative if Z points back along the arm. At least
+    `CLEAR_M` from the last and the previous link, rounded up to cm, and at least
+    `LEAST_MARKER_M`. ``bodies``: the collision geometry; ``link_radius``: of the links in the
+    line of sight, m.
     """
     # The previous link ends at the last joint's origin.
     T_T_joint = inverse(chain.T_fixed[-1])

@@ -39,12 +39,12 @@ class PlannedVisit:
 
     @property
     def points(self) -> FloatArray:
-        """Corners of the path, rad, (n + 1, k) for n lines."""
+        """Corners of the path from the previous configuration, rad, (n + 1, k) for n lines."""
         return self.trajectory.points
 
     @property
     def q(self) -> FloatArray:
-        """The configuration, rad, (k,)."""
+        """The configuration that is measured, at the end of the path, rad, (k,)."""
         return self.trajectory.end
 
 
@@ -134,9 +134,10 @@ def look_ahead(
 ) -> CollectionPlan:
     """Plan the remaining visits of tours, the collection's last, without changing the tours.
 
-    ``tours``: one after the other; ``visit``: remaining visit of the pose under way, which comes
-    first; other arguments as of `plan_collection`. If the poses do not determine the offsets, the
-    plan has `undetermined`. ``start``: configuration of the arm, rad or m, (k,).
+    ``planner``: plans the tours, its designs are stated; ``tours``: one after the other;
+    ``visit``: remaining visit of the pose under way, which comes first; ``start``:
+    configuration of the arm, rad or m, (k,); other arguments as of `plan_collection`. If the
+    poses do not determine the offsets, the plan's `undetermined` says why.
 
     Raises InsufficientDataError if no configuration can be reached.
     """
@@ -228,9 +229,9 @@ def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float
 
 
 def rough_collection(planner: TourPlanner) -> tuple[Tour, Expected]:
-    """Return a collection with the sensors at their rough positions, without its paths.
+    """Return the tour of a collection, with sensors at their rough positions, and its precision.
 
-    The search for paths takes nearly all the time of `plan_collection`; without it unreachable
+    No paths are searched, which takes nearly all the time of `plan_collection`: unreachable
     configurations (`count_with_free_path` counts poses) and the robot time are unknown.
     Raises InsufficientDataError if no pose is left to fit, or the poses do not determine the
     offsets.
@@ -242,14 +243,14 @@ def rough_collection(planner: TourPlanner) -> tuple[Tour, Expected]:
 def count_with_free_path(
     tour: Tour, model: CollisionModel, start: FloatArray, enough: int
 ) -> tuple[int, int]:
-    """Return the numbers of fitted poses with a free path from the start, and of those tried.
+    """Return the numbers of poses to fit with a free path from the start, and of those tried.
 
-    One joint solution of a pose is enough, which takes a small part of the time of all paths. If
-    that finds few, the whole tour is searched as in a collection, up to `MOST_MISSED` poses
-    without a path.
+    At first one joint solution of each pose is tried, which takes a small part of the time of
+    all paths. If that finds fewer than `enough`, the whole tour is searched as in a
+    collection, up to `MOST_MISSED` poses without a path. The tour is not changed.
 
-    ``tour``: of reachable poses; ``model``: obstacles; ``start``: rad, (k,); ``enough``: number of
-    poses at which the count ends.
+    ``tour``: of reachable poses; ``model``: obstacles; ``start``: rad, (k,); ``enough``:
+    number of poses at which the count ends.
     """
     fitted = {FITTED: tour.plans[FITTED]}
     quick = Tour(tour.chain, fitted, one_solution=True, model=model)
@@ -289,10 +290,11 @@ def expected_collection(
 
 
 class _Steps:
-    """The motions of an arm from visit to visit.
+    """The motions of an arm from visit to visit, as they are planned.
 
-    ``here``: the arm's configuration, rad, (k,); ``travel``: travel times; ``progress``: called
-    with the number of visits.
+    ``here``: the arm's configuration, rad, (k,); ``travel``: travel times; ``progress``:
+    called with the number of visited configurations so far.
+    Attributes: ``visits``; ``unreached``: split, pose and solution of each one without a path.
     """
 
     def __init__(
@@ -303,9 +305,10 @@ class _Steps:
         self.unreached: list[tuple[str, int, int]] = []
 
     def go(self, visit: PoseVisit) -> None:
-        """Add the motions to all solutions of a visit, from `here`, which becomes the last one.
+        """Add the motions to all solutions of a visit, the first from `here`.
 
-        Solutions without a path are added to `unreached`.
+        The last solution is `here` afterwards. Solutions without a path are added to
+        `unreached`.
         """
         self.unreached += [(visit.split, visit.index, number) for number in visit.unreached]
         for q, through, shares in zip(visit.solutions, visit.paths, visit.shares, strict=True):
@@ -325,8 +328,9 @@ def expected_precision(
 ) -> Expected:
     """Return the expected precision of a fit of these poses in all their solutions.
 
-    Of a planner of motion that of its curves. ``T_R_N``: registrations, (4, 4); other sensors are
-    left out. Raises as `DesignInformation.of`.
+    If the planner has chosen curves to measure in motion, theirs, whatever the poses are.
+    ``T_R_N``: registration of each sensor, (4, 4); other sensors are left out. Raises as
+    `DesignInformation.of`.
     """
     if planner.moving_design is not None:
         moving = planner.moving_design.expected

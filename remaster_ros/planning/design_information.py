@@ -48,7 +48,7 @@ and changes no standard deviation once the parameters are determined."""
 
 @dataclass(frozen=True, eq=False)
 class ExtraColumns:
-    """Parameters added to those of the offsets model: of causes to be distinguished."""
+    """Further parameters of the linear model, such as the sizes of causes to be separated."""
 
     names: tuple[str, ...]  # Of m parameters
     # Context -> displacement of the markers in R per unit of each parameter, m, (n, 3, m)
@@ -58,7 +58,7 @@ class ExtraColumns:
 
 @dataclass(frozen=True, eq=False)
 class DesignInformation:
-    """Fisher information of n configurations on the f free parameters.
+    """Fisher information of n configurations on the f free parameters of a fit.
 
     Parameters are divided by `scale`, so that the mean information on each is 1.
     """
@@ -186,10 +186,11 @@ class DesignInformation:
         )
 
     def whole_poses(self) -> tuple[DesignInformation, list[IntArray]]:
-        """Return the information of poses with all their configurations, and their indices.
+        """Return the information of whole poses, each with all its configurations.
 
-        Poses have no error in common, so that their information adds up. They are in the order of
-        their numbers; `q` is the first configuration of each.
+        Also the indices of the configurations of each pose. Poses have no error in common, so
+        that their information adds up. They are in the order of their numbers; in the result a
+        pose counts as one configuration, and `q` is its first one.
         """
         members = [np.flatnonzero(self.pose == index) for index in np.unique(self.pose)]
         sums = np.array([self.weighted[indices].sum(axis=0) for indices in members])
@@ -206,9 +207,10 @@ class DesignInformation:
         return poses, members
 
     def total(self, chosen: Sequence[int]) -> FloatArray:
-        """Information of chosen configurations and priors, (f, f), less what poses share.
+        """Information of chosen configurations together with the priors, (f, f).
 
-        ``chosen``: their indices; () gives the priors alone. In units of `scale`.
+        The information that is lost to the error common to each pose is subtracted.
+        ``chosen``: indices of configurations; () gives the priors alone. In units of `scale`.
         """
         which = np.array(chosen, dtype=np.int64)
         sums, count = self._sums(chosen)
@@ -230,8 +232,9 @@ class DesignInformation:
     def gains(self, chosen: Sequence[int], root: FloatArray) -> FloatArray:
         """Return the first-order decrease of trace(L' M^-1 L) by each configuration, (n,).
 
-        It is trace(K' dM K) for the information dM that the configuration adds and K = M^-1 L,
-        which is ``root``, (f, r). ``chosen``: indices of the configurations so far.
+        It is trace(K' dM K) for the information dM that the configuration adds to M, that of
+        the chosen ones, and K = M^-1 L, which is ``root``, (f, r). ``chosen``: indices of the
+        configurations so far.
         """
         sums, count = self._sums(chosen)
         of_sums, of_each = sums @ root, self.weighted @ root
@@ -244,9 +247,10 @@ class DesignInformation:
         return result
 
     def _sums(self, chosen: Sequence[int]) -> tuple[FloatArray, IntArray]:
-        """Return the sum of J/v over each pose's chosen, (poses, s, 3, f), and their number.
+        """Sums of J/v over the chosen configurations of each pose, (poses, s, 3, f), and counts.
 
-        Poses without a chosen configuration have 0.
+        J/v as in `weighted`, for s sensors; the counts of chosen configurations are (poses,).
+        Both are 0 for a pose without one. ``chosen``: indices of configurations.
         """
         which = np.array(chosen, dtype=np.int64)
         sums = np.zeros((int(self.pose.max()) + 1, *self.weighted.shape[1:]))
@@ -254,13 +258,17 @@ class DesignInformation:
         return sums, np.bincount(self.pose[which], minlength=len(sums))
 
     def _factor(self, count: IntArray) -> FloatArray:
-        """Return pose_sigma² / (1 + m pose_sigma² / v) for frame counts m (p,), (p, s), m²."""
+        """Factors pose_sigma² / (1 + m pose_sigma² / v) of the common errors, (p, s), m².
+
+        ``count``: number m of configurations of each of p poses, (p,); s sensors. See the
+        module.
+        """
         return self.pose_variance / (1.0 + count[:, None] * self.pose_variance * self.weight)
 
     def _shared(self, sums: FloatArray, count: IntArray) -> FloatArray:
-        """Return the information lost to the common error of each pose, (poses, f, f).
+        """Return the information lost to the error common to each pose, (poses, f, f).
 
-        ``sums``, ``count``: as returned by `_sums`.
+        ``sums, count``: for each pose, as returned by `_sums`.
         """
         rooted = np.sqrt(self._factor(count))[:, :, None, None] * sums
         return _squares(rooted.reshape(len(sums), 3 * len(self.weight), len(self.scale)))
@@ -306,7 +314,8 @@ class DesignInformation:
     def tool_rms(self, chosen: Sequence[int]) -> float:
         """Return the root mean square 3-D error of the predicted markers in the box, m.
 
-        ``chosen``: indices of configurations; the mean is over all candidates in the box.
+        ``chosen``: indices of the configurations measured; the mean is over the markers at all
+        candidate configurations with the tool in the box (at all, without a box).
         """
         covariance = np.linalg.inv(self.finite(self.total(chosen)))
         return float(np.sqrt(np.sum(covariance * self.tool)))
@@ -330,5 +339,5 @@ def nominal_context(model: Model, x: FloatArray, measurements: Measurements) -> 
 
 
 def _squares(values: FloatArray) -> FloatArray:
-    """Return J'J of each J (..., rows, f), (..., f, f)."""
+    """Return J'J for each matrix J, (..., f, f); ``values``: the matrices, (..., rows, f)."""
     return np.swapaxes(values, -1, -2) @ values

@@ -38,7 +38,7 @@ class ExpectedSensor:
 
 @dataclass(frozen=True)
 class ToolBox:
-    """A box in R in which the tool has to be accurate."""
+    """A box along the axes of the robot base frame R, in which the tool has to be accurate."""
 
     center_m: FloatArray  # In R, (3,)
     size_m: FloatArray  # Edge lengths, (3,)
@@ -78,10 +78,11 @@ def nominal_model(
 def expected_priors(
     model: Model, x: FloatArray, marker_std_m: float, priors: Priors
 ) -> tuple[Prior, ...]:
-    """Return the priors of a fit: of all markers, then bases and offsets that are given.
+    """Return the priors of a fit: on all markers, then on given registrations and offsets.
 
-    Only the widths of those on offsets matter here. ``x``: nominal parameters; ``marker_std_m``:
-    of marker positions without a prior, per axis. Raises ValueError if a name is not in the model.
+    ``x``: nominal parameters, (size,), about which the markers' priors are; ``marker_std_m``:
+    prior standard deviation of a marker's position without a stated one, per axis, m;
+    ``priors``: the stated ones. Raises ValueError if a name is not in the model.
     """
     markers = model.markers(x)
     prior_list = [
@@ -143,9 +144,10 @@ def expected_measurements(
 def expected_rows(
     model: Model, x: FloatArray, measurements: Measurements, sensors: Sequence[ExpectedSensor]
 ) -> Rows:
-    """Return rows whose targets are predictions at x, displaced by the expected noise.
+    """Return rows of a fit whose targets are the predictions at x, displaced by the noise.
 
-    Each coordinate by the root of the sum of squares of the sensor's three noises, m.
+    Each coordinate is larger by the root of the sum of squares of the sensor's three noises,
+    m. ``x``: nominal parameters, (size,).
     """
     rows = Rows.of(measurements, np.arange(len(measurements)), model.reference)
     target = model.predict(model.pinned(x), rows)

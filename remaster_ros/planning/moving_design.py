@@ -84,7 +84,7 @@ OVERTIME = 30.0
 
 @dataclass(frozen=True, eq=False)
 class MovingDesign:
-    """Curves of a session, and their expected precision."""
+    """Curves along which a session is measured in motion, and their expected precision."""
 
     begin: PlannedPose
     # Each with its way from the end of the one before
@@ -106,7 +106,7 @@ class MovingDesign:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A curve within all limits."""
+    """A curve within joint, speed and acceleration limits, and its information."""
 
     points: FloatArray  # With begin and end, (n, k)
     shares: FloatArray
@@ -127,12 +127,16 @@ def design_moving(
     before: FloatArray | None = None,
     exchanges: int | None = None,
 ) -> MovingDesign:
-    """Choose curves of a total time.
+    """Choose curves of a total time, along which the arm is measured while it moves.
 
     Parameters
     ----------
-    scene, travel, settings
-        See there.
+    scene
+        The arm, its obstacles, and the ranges of poses.
+    travel
+        Speed and acceleration limits, and times of measuring.
+    settings
+        Sensors with their noise, and priors.
     sensors_R
         Position in R of each sensor that has to see its markers, m, (3,).
     rng
@@ -140,8 +144,8 @@ def design_moving(
     moving_s
         Time of measured motion, s.
     before
-        Configuration from which the arm comes, rad, (k,): the curves begin near it; None if that
-        is unknown.
+        Configuration from which the arm comes, rad, (k,): the curves begin near it; None if
+        that is unknown.
     exchanges
         Changes that are tried; None for `EXCHANGES`.
 
@@ -167,7 +171,11 @@ def design_moving(
 
 
 def check_sensors(scene: PlanningScene, sensors: Sequence[ExpectedSensor]) -> None:
-    """Raise InputError if sensors or arm cannot be measured while the arm moves."""
+    """Raise InputError if the sensors or the arm do not allow measuring in motion.
+
+    That is: a joint slides, or a sensor measures on request, or has fewer than
+    `FEWEST_MARKERS` markers.
+    """
     slides = np.flatnonzero(scene.model.chain.slides)
     if len(slides):
         raise InputError(
@@ -190,7 +198,10 @@ def check_sensors(scene: PlanningScene, sensors: Sequence[ExpectedSensor]) -> No
 
 
 def sights_of(scene: PlanningScene, sensors: Sequence[ExpectedSensor]) -> list[LineOfSight]:
-    """Lines of sight to every marker, not only to the one that a sensor follows."""
+    """Lines of sight from each sensor to each of its markers.
+
+    ``sensors``: with their positions; the largest angles of sight are those of the scene.
+    """
     angles = {sight.sensor: sight.max_angle_rad for sight in scene.sights}
     return [
         LineOfSight(sensor.name, sensor.position_R, place, angles[sensor.name], marker)
@@ -205,7 +216,10 @@ def stays_in_sight(
     settings: DesignSettings,
     sensors_R: Mapping[str, FloatArray],
 ) -> bool:
-    """Whether sensors at these positions in R, m, (3,), see every marker all along the curves."""
+    """Whether sensors see every marker all along the curves and at their ends.
+
+    ``sensors_R``: position of each sensor in the robot base frame R, m, (3,).
+    """
     sights = sights_of(scene, settings.with_sensors_at(sensors_R).sensors)
     ends = np.array([pose.solutions[0] for pose in (design.begin, *design.ends)])
     places = [ends, *map(_fine, design.curves)]
@@ -213,7 +227,7 @@ def stays_in_sight(
 
 
 class _Search:
-    """Curves under way."""
+    """Search for curves: first ones are drawn, then places on them are exchanged."""
 
     def __init__(
         self,
@@ -240,7 +254,13 @@ class _Search:
         self._pieces: list[_Piece] = []
 
     def _drawn(self, sensors: Sequence[ExpectedSensor], before: FloatArray | None) -> FloatArray:
-        """Configurations in sight in one part of joint space, (n, k)."""
+        """Draw configurations that are usable, from one part of joint space, rad or m, (n, k).
+
+        The part is about a solution of a candidate pose with many others near it, and near to
+        ``before``, where the arm comes from, unless that is None; this solution is the first
+        row. At most `POOL`; raises InsufficientDataError if fewer than `FEWEST_POOL` are
+        found.
+        """
         sensors_R = {sensor.name: sensor.position_R for sensor in sensors}
         plan = scene_with_other_elbows(self._scene).plan(POOL_CANDIDATES, sensors_R, self._rng)
         half_width = NEAR_RAD * self._chain.per_radian
@@ -273,7 +293,11 @@ class _Search:
         return pool
 
     def usable(self, q: FloatArray) -> BoolArray:
-        """Whether configurations (n, k) are in the ranges, within limits, in sight and free."""
+        """Whether configurations (n, k) are usable, (n,).
+
+        They are with the tool in the ranges of poses, joints within limits with their margin,
+        every marker in sight, and the arm free of collisions with a reserve.
+        """
         chain = self._chain
         good = chain.within_limits(q, -self._margin)
         good &= self._scene.ranges.contain(chain.positions(q, np.zeros(3)))
@@ -286,9 +310,11 @@ class _Search:
         return in_sight(self._scene, self._sights, q)
 
     def piece(self, points: FloatArray, begin_s: float) -> _Piece | None:
-        """Curve through configurations (n, k), if within limits, and its information; else None.
+        """Curve through configurations (n, k) with its information; None if it is not allowed.
 
-        Whether it is free and in sight takes longer, see `_is_free`.
+        It is not if it leaves joint limits, takes more than `LONGEST_S`, or has places less
+        than `APART_S` apart. Collisions and sight are checked by `_is_free`, which takes
+        longer. ``begin_s``: time at which it begins, s.
         """
         found = shared_curve(points, self._travel)
         if found is None:
@@ -318,7 +344,10 @@ class _Search:
         )
 
     def _first_piece(self) -> _Piece | None:
-        """Draw a curve from where the one before ends; None if none is found."""
+        """Draw a curve from the end of the last one (at first from the pool's first row).
+
+        It is free of collisions and in sight. None if `TRIES` draws find none.
+        """
         here = self._pieces[-1].points[-1] if self._pieces else self._pool[0]
         count = round(self._curve_s / BETWEEN_S)
         for attempt in range(TRIES):
@@ -332,13 +361,17 @@ class _Search:
         return None
 
     def _is_free(self, piece: _Piece) -> bool:
-        """Whether the arm is free and every marker in sight all along."""
+        """Whether the arm is free of collisions and every marker in sight all along a curve."""
         if not self._model.free_mask(piece.q, RESERVE_M).all() or not self.seen(piece.q).all():
             return False
         return not self._model.path_trouble(piece.curve.spline.samples[1], self._extra)
 
     def _near(self, here: FloatArray, there: FloatArray | None) -> FloatArray:
-        """Draw a configuration of the pool that is some seconds from one, or from two others."""
+        """Draw a configuration from the pool near to ``here``, and also to ``there`` if not None.
+
+        Near is a travel time of `NEAR_S` to `FAR_S` (the longer of the two); if none is, one
+        of the nearest. (k,).
+        """
         sample = self._rng.permutation(self._pool)[:SAMPLE]
         ends = [here] if there is None else [here, there]
         # At full speed along straight lines.
@@ -349,6 +382,10 @@ class _Search:
         return sample[int(self._rng.choice(neighbours))]
 
     def _cost_of(self, pieces: Sequence[_Piece]) -> float:
+        """Cost of curves: log of the expected variance of the offsets, and prices of their time.
+
+        Time beyond the given in all, and curves shorter than `SHORTEST_S`, cost `OVERTIME`.
+        """
         total = np.sum([piece.information for piece in pieces], axis=0)
         seconds = [piece.curve.duration_s for piece in pieces]
         cost = float(np.log(self._information.variance(total)))
@@ -356,7 +393,11 @@ class _Search:
         return cost + OVERTIME * sum(max(1.0 - each / SHORTEST_S, 0.0) for each in seconds)
 
     def exchange(self) -> None:
-        """Try one change of one place; keep it if the cost falls."""
+        """Try one random change of a place on a curve; keep it if the cost falls.
+
+        A place is left out, inserted, drawn anew, or shifted; the end of a curve is the begin
+        of the next one, too.
+        """
         rng = self._rng
         number = int(rng.integers(len(self._pieces)))
         points = self._pieces[number].points
@@ -395,7 +436,7 @@ class _Search:
             self._pieces, self._cost = pieces, cost
 
     def result(self, settings: DesignSettings, travel: TravelTime) -> MovingDesign:
-        """Return the design."""
+        """Return the design with the curves found so far, and its expected precision."""
         pieces = self._pieces
         begin = self._pose(pieces[0].points[0])
         ends = [
@@ -446,6 +487,7 @@ class _Search:
         )
 
     def _pose(self, q: FloatArray) -> PlannedPose:
+        """Planned pose of the tool at a configuration (k,), which is its only joint solution."""
         return PlannedPose(self._chain.forward(q), q[None])
 
 
@@ -457,14 +499,17 @@ def _fine(curve: Curve) -> FloatArray:
 
 
 def _with(points: FloatArray, at: int, new: FloatArray) -> FloatArray:
-    """Points (n, k) with another one at an index."""
+    """Return a copy of points (n, k) with the one at an index replaced by ``new``, (k,)."""
     changed = points.copy()
     changed[at] = new
     return changed
 
 
 def in_sight(scene: PlanningScene, sights: Sequence[LineOfSight], q: FloatArray) -> BoolArray:
-    """Whether all markers face their sensors at configurations (n, k) and no link hides them."""
+    """Whether all markers face their sensors and nothing hides them, (n,).
+
+    ``q``: configurations, rad or m, (n, k).
+    """
     good = np.ones(len(q), bool)
     for sight in sights:
         good[good] = ~is_hidden(scene.model, q[good], sight)
@@ -472,13 +517,13 @@ def in_sight(scene: PlanningScene, sights: Sequence[LineOfSight], q: FloatArray)
 
 
 def shared_curve(points: FloatArray, travel: TravelTime) -> tuple[FloatArray, Curve, float] | None:
-    """Curve through configurations (n, k), with shares such that the limits are used evenly.
+    """Spline curve through configurations (n, k), timed so that its limits are used evenly.
 
-    Each interval has a share by the time that its straight line takes; then intervals in which the
-    curve could be faster become shorter, and the others longer.
+    Each interval has a share by the time that its straight line takes; then intervals in which
+    the curve could be faster become shorter, and the others longer.
 
-    Returns shares (n,), the curve, and the largest speed of a point, m/s; None if the spline would
-    have too many samples.
+    Returns shares (n,), from 0 to 1, the curve, and the largest speed of a point, m/s; None if
+    the spline would have too many samples.
     """
     limits = travel.limits
     way = np.abs(np.diff(points, axis=0))

@@ -60,7 +60,7 @@ UNKNOWN = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class MotionRows:
-    """Rows of an arm that moves, n rows and k joints."""
+    """Joint positions, velocities and accelerations of a moving arm at n times, k joints."""
 
     seconds: FloatArray  # Times of their middles since the start of the motion, s, (n,)
     q: FloatArray  # rad or m, (n, k)
@@ -69,7 +69,10 @@ class MotionRows:
 
     @classmethod
     def of(cls, curve: Curve, begin_s: float = 0.0) -> MotionRows:
-        """Rows of whole tenths of seconds along a curve that begins at a time, s."""
+        """Rows at the middles of intervals of 0.1 s (`ROW_S`) along a curve.
+
+        ``begin_s``: time at which the curve begins, added to the times, s. At least one row.
+        """
         count = max(int(curve.duration_s / ROW_S), 1)
         t: FloatArray = ROW_S * (np.arange(count, dtype=np.float64) + 0.5)
         share, rate = np.transpose([curve.share(time_s) for time_s in t.tolist()])
@@ -153,7 +156,7 @@ class MovingInformation:
         self.prior: FloatArray = np.diag(std**-2.0)
 
     def of(self, rows: MotionRows) -> FloatArray:
-        """Information of the rows of a motion, (p, p)."""
+        """Information of the rows of one motion, (p, p), without that of the priors."""
         chain, n, k = self._chain, len(rows.q), len(self._chain)
         rates, nowhere = (rows.velocity, rows.acceleration), np.full_like(rows.q, np.nan)
         motion = MotionColumns(chain, rows.q, *rates, rows.seconds, nowhere)
@@ -192,12 +195,19 @@ class MovingInformation:
         return total
 
     def variance(self, information: FloatArray) -> float:
-        """Mean variance of the offsets of the inner joints, rad², by information and priors."""
+        """Mean variance of the offsets of the `inner` joints, by information and priors, rad².
+
+        ``information``: sum of `of` over the motions, (p, p).
+        """
         return float(np.mean(np.diag(_inverse(information + self.prior))[self.inner]))
 
 
 def process_along(tool: FloatArray) -> FloatArray:
-    """Correlations of a sensor's error between places of the tool, T_R_T (n, 4, 4), (n, n)."""
+    """Correlations of a sensor's error between tool poses along a motion, (n, n).
+
+    ``tool``: poses T_R_T, (n, 4, 4). Those of the process of `calibration.path_noise` with the
+    lengths that a fit begins with.
+    """
     noise = PathNoise(
         tool[:, :3, 3],
         tool[:, :3, :3].reshape(-1, 9),
@@ -241,7 +251,10 @@ def _information(
 
 
 def _inverse(information: FloatArray) -> FloatArray:
-    """Covariance by information of parameters of any units, with a ridge (`UNKNOWN`), (p, p)."""
+    """Inverse of an information matrix (p, p) of parameters of any units, their covariance.
+
+    With a ridge (`UNKNOWN`), so that a singular matrix gives large variances.
+    """
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
     scaled = information * np.outer(unit, unit) + UNKNOWN * np.eye(len(unit))
     return np.asarray(np.linalg.inv(scaled) * np.outer(unit, unit))
@@ -266,8 +279,9 @@ def expected_along(
 ) -> MovingExpected:
     """Expected precision of a fit of all rows of motions, with errors correlated along the path.
 
-    ``own_m``: error of each marker by itself, see `OWN_M`. Raises InsufficientDataError if they do
-    not determine the parameters.
+    ``rows``: of all motions; ``marker_std_m``: prior of the markers' positions, per axis, m;
+    ``priors``: of offsets and registrations; ``own_m``: error of each marker by itself, see
+    `OWN_M`. Raises InsufficientDataError if the rows do not determine the parameters.
     """
     n = len(rows.q)
     model, x = nominal_model(chain, rows.q, sensors, priors)

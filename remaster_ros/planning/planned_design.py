@@ -60,7 +60,10 @@ class DesignSettings:
     priors: Priors = field(default_factory=Priors)  # Of offsets, markers and registrations
 
     def with_sensors_at(self, sensors_R: Mapping[str, FloatArray]) -> DesignSettings:
-        """Return the settings for sensors at these positions in R, m, (3,) each, and no others."""
+        """Return a copy with the sensors at other positions, and without those that have none.
+
+        ``sensors_R``: sensor -> position in the robot base frame R, m, (3,).
+        """
         placed = [
             replace(sensor, position_R=sensors_R[sensor.name])
             for sensor in self.sensors
@@ -69,7 +72,10 @@ class DesignSettings:
         return replace(self, sensors=tuple(placed))
 
     def information(self, scene: PlanningScene, poses: Sequence[PlannedPose]) -> DesignInformation:
-        """Return the information of poses. Raises as `DesignInformation.of`."""
+        """Return the information of poses in all their solutions by these sensors and priors.
+
+        Raises as `DesignInformation.of`.
+        """
         chain = scene.model.chain
         return DesignInformation.of(
             chain, poses, self.sensors, self.marker_std_m, self.priors, self.box
@@ -109,14 +115,16 @@ def designed_plans(
     travel: TravelTime,
     rng: np.random.Generator,
 ) -> DesignResult:
-    """Choose configurations that reach a precision in least time: a stated one, or that of plans.
+    """Choose the configurations to fit that reach a precision in the least robot time.
 
-    ``scene, settings``: see there; ``plans``: of Latin hypercubes, by split; the poses to fit are
-    among the candidates, so that the precision of these plans can be reached; of the validation
-    poses the first `HELD_OUT_POSES` are kept; ``sensors_R``: position in R of each sensor that has
-    to see its marker, m, (3,); ``travel``: cost of configurations; ``rng``: for candidates and
-    choice. If a chosen configuration has no path to the others, the choice is repeated without it,
-    at most `MOST_TRIES` times.
+    The precision is that stated in ``settings``, or else that of ``plans``.
+
+    ``scene``: the arm, its obstacles and sensors; ``plans``: of Latin hypercubes, by split;
+    the poses to fit are among the candidates, so that the precision of these plans can be
+    reached; of the validation poses the first `HELD_OUT_POSES` are kept; ``sensors_R``:
+    position in R of each sensor that has to see its marker, m, (3,); ``travel``: cost of
+    configurations; ``rng``: for candidates and choice. If a chosen configuration has no path
+    to the others, the choice is repeated without it, at most `MOST_TRIES` times.
 
     Raises InputError and InsufficientDataError as `DesignInformation.of` and `Goal.weights`.
     """
@@ -183,10 +191,10 @@ def designed_plans(
 
 
 def _floors(information: DesignInformation, candidates: IntArray, whole_poses: bool) -> Floors:
-    """Return the floors, lowered to what these configurations can reach.
+    """Return the least contents of a design, lowered to what the candidates can reach.
 
-    All whole poses should have two solutions, for which they are visited whole. ``candidates``:
-    indices of the configurations.
+    If poses are visited whole, all of them should have two solutions or more. ``candidates``:
+    indices of the candidate configurations.
     """
     count = np.unique(information.pose[candidates], return_counts=True)[1]
     floors = Floors()
@@ -195,9 +203,10 @@ def _floors(information: DesignInformation, candidates: IntArray, whole_poses: b
 
 
 def _held_out(plan: Plan, solutions: int | None, rng: np.random.Generator) -> Plan:
-    """Return the first `HELD_OUT_POSES` validation poses, the others counted as not needed.
+    """Return a plan of the first `HELD_OUT_POSES` validation poses of a plan.
 
-    ``solutions``: how many of each are drawn at random; None for all.
+    The others are counted as dropped, not needed. ``solutions``: how many of each pose are
+    drawn at random; None for all.
     """
     kept = tuple(
         PlannedPose(
@@ -217,10 +226,11 @@ def _held_out(plan: Plan, solutions: int | None, rng: np.random.Generator) -> Pl
 
 
 def _isolated_groups(model: CollisionModel, q: FloatArray, travel: TravelTime) -> list[IntArray]:
-    """Return the groups of configurations (n, k) without a free path to the largest group.
+    """Return the groups of configurations that have no free path to the largest group.
 
-    Paths are searched from each configuration to its two nearest, then from the largest connected
-    group to each other group, between their two nearest configurations.
+    Each as indices, (m,). Paths are searched from each configuration to its two nearest, then
+    from the largest connected group to each other group, between their two nearest
+    configurations. ``q``: configurations, (n, k).
     """
     times = travel.between(q)
     np.fill_diagonal(times, np.inf)

@@ -55,10 +55,11 @@ FIRST, LOOKED_AT = 12, 64
 
 @dataclass(frozen=True)
 class Floors:
-    """Least contents of a design, so that a search for causes finds unexpected ones.
+    """Least numbers of poses, and of repeated poses, in a design.
 
-    A design for the offsets alone would repeat few poses; they would lie where the offsets' model
-    is most sensitive, and nothing would test the model in between.
+    With them a search for causes can find unexpected ones: a design for the offsets alone
+    would repeat few poses; they would lie where the offsets' model is most sensitive, and
+    nothing would test the model in between.
     """
 
     # Different poses to fit, as many as a search for causes needs
@@ -66,9 +67,9 @@ class Floors:
     repeated: int = REPEATED_POSES  # Poses with at least two solutions
 
     def hold(self, pose: IntArray) -> bool:
-        """Whether configurations of these poses (n,) are enough.
+        """Whether a design has at least `poses` poses, and `repeated` with two configurations.
 
-        ``pose``: number of the pose of each configuration.
+        ``pose``: number of the pose of each configuration of the design, (n,).
         """
         count = np.unique(pose, return_counts=True)[1]
         return len(count) >= self.poses and int(np.sum(count > 1)) >= self.repeated
@@ -110,7 +111,7 @@ class Goal:
     def is_met(self, joint_rms: float, tool_rms: float) -> bool:
         """Whether standard deviations of joints, rad, and tool, m, reach the goal.
 
-        The one without weight does not count.
+        Joints do not count if only the tool has weight (`tool_share` 1), the tool not at 0.
         """
         joints = self.tool_share == 1.0 or joint_rms <= self.joint_std_rad
         return joints and (self.tool_share == 0.0 or tool_rms <= self.tool_std_m)
@@ -132,7 +133,7 @@ class Goal:
 
 @dataclass(frozen=True)
 class Design:
-    """The chosen configurations."""
+    """The chosen configurations, and whether they reach the goal."""
 
     chosen: tuple[int, ...]  # Indices of the configurations, in no order
     reached: bool  # Whether goal and floors are reached
@@ -175,9 +176,10 @@ def choose(
 class _Units:
     """The units of the choice: configurations, or poses with all their configurations.
 
-    ``whole``: whether they are poses; ``information``: of each of the n units; ``members``:
-    indices of each unit's configurations; ``solutions``: number of them, (n,); ``stay_s``: time of
-    measuring them and of the motions between them, s, (n,).
+    ``whole_poses``: whether they are poses.
+    Attributes: ``information``: of each of the n units; ``members``: indices of each unit's
+    configurations; ``solutions``: number of them, (n,); ``stay_s``: time of measuring them and
+    of the motions between them, s, (n,).
     """
 
     def __init__(
@@ -199,9 +201,10 @@ class _Units:
         self._near: dict[int, FloatArray] = {}
 
     def _time_within(self, q: FloatArray) -> float:
-        """Return the mean time through all solutions (m, k) of a pose, nearest next, s.
+        """Return the mean time of motion through all solutions (m, k) of a pose, s.
 
-        The mean over the solution begun with; solutions in the order of their time from it.
+        They are visited in the order of the travel time from the first one; the mean is over
+        which one is first. 0 for a single solution.
         """
         times = self._travel.between(q)
         order = np.argsort(times, axis=1)
@@ -209,9 +212,10 @@ class _Units:
         return float(np.mean(np.sum(along, axis=(1, 2))))
 
     def near(self, index: int) -> FloatArray:
-        """Return the time from one unit to each unit, s, (n,); infinite to itself.
+        """Return the travel time from a unit to each unit, s, (n,); infinite to itself.
 
-        Between their nearest configurations, by a straight line; computed once for each.
+        Between their nearest configurations, by a straight line; kept after the first call.
+        ``index``: of the unit.
         """
         if index not in self._near:
             # The nearest pair is found without the limit of the tool's speed, which takes long.
@@ -240,23 +244,27 @@ class _Units:
 
 
 class _Search:
-    """Greedy choice and exchange of units, by their gain and cost."""
+    """Greedy choice and exchange of units (configurations or poses), by gain and robot time."""
 
     def __init__(self, units: _Units, goal: Goal, floors: Floors) -> None:
         self._units, self._information, self._goal = units, units.information, goal
         self._floors, self._root = floors, goal.weights(units.information)
 
     def _criteria(self, matrices: FloatArray) -> FloatArray:
-        """Return trace(L' M^-1 L) of information matrices (..., f, f), (...)."""
+        """Return the criterion trace(L' M^-1 L) of each information matrix, (...).
+
+        L are the weights of the goal. ``matrices``: M, (..., f, f), to which a ridge is added.
+        """
         finite = self._information.finite(matrices)
         root = np.broadcast_to(self._root, (*finite.shape[:-2], *self._root.shape))
         return np.einsum('ij,...ij->...', self._root, np.linalg.solve(finite, root))
 
     def _with_each(self, chosen: Sequence[int], allowed: BoolArray) -> tuple[IntArray, FloatArray]:
-        """Return the most promising units of those allowed, and the criterion with each, (m,).
+        """Return the indices of m promising units, and the criterion if each is added, (m,).
 
-        ``allowed``: (n,), less the chosen ones. Of more than `LOOKED_AT` after `FIRST` chosen
-        ones, those with the largest gain to first order for their time.
+        Promising are all allowed and not chosen; of more than `LOOKED_AT`, once more than
+        `FIRST` are chosen, those with the largest first-order gain for their time. ``chosen``:
+        indices; ``allowed``: (n,).
         """
         information = self._information
         allowed = allowed.copy()
@@ -273,10 +281,10 @@ class _Search:
         return candidates, self._criteria(information.with_each(chosen, candidates))
 
     def _times(self, chosen: Sequence[int]) -> FloatArray:
-        """Return each unit's addition to the robot time of the chosen units, s, (n,).
+        """Return the robot time that each unit would add to the chosen ones, s, (n,).
 
-        From the nearest other chosen unit, infinite without another one, and for measuring;
-        without chosen ones for measuring alone.
+        For travel from the nearest chosen unit, and for measuring; travel is 0 if none is
+        chosen, infinite for the only chosen unit itself. ``chosen``: indices of units.
         """
         if not chosen:
             return self._units.stay_s
@@ -284,7 +292,7 @@ class _Search:
         return travel_s + self._units.stay_s
 
     def is_done(self, chosen: Sequence[int]) -> bool:
-        """Whether chosen units reach goal and floors."""
+        """Whether chosen units reach the goal's precision and the floors' numbers of poses."""
         return self._floors.hold(self._poses(chosen)) and self._goal.is_reached(
             self._information, chosen
         )
@@ -295,10 +303,11 @@ class _Search:
         return np.repeat(self._information.pose[which], self._units.solutions[which])
 
     def _best_addition(self, chosen: Sequence[int]) -> int:
-        """Return the unit with the largest gain for its time, raised to `URGENCY`.
+        """Return the index of the unit to add: that with the largest gain for its time.
 
-        The gain is the decrease of the criterion's logarithm. If the goal is reached, a unit that
-        the floors lack; of whole poses then the one of least time. A unit must be left.
+        The gain is the decrease of the criterion's logarithm, divided by the time to the power
+        `URGENCY`. Once the goal is reached, only units that the floors lack are considered, of
+        whole poses that of least time. ``chosen``: indices of units, not all.
         """
         allowed = np.ones(len(self._information), bool)
         if chosen and self._goal.is_reached(self._information, chosen):
@@ -333,9 +342,10 @@ class _Search:
         return new
 
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
-        """Return the units extended until the design is done or has `most` configurations.
+        """Return the chosen units and more, until the design is done, in a new list.
 
-        Also without reaching the goal, when all units are chosen. ``chosen``: indices of units.
+        It also ends with `most` configurations, or when all units are chosen. ``chosen``:
+        indices of units.
         """
         chosen = list(chosen)
         while len(chosen) < len(self._information) and not self.is_done(chosen):
@@ -347,8 +357,9 @@ class _Search:
     def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
         """Return a random exchange: a pose added, or a few removed and the design filled up.
 
-        Each with probability 1/2; up to four poses are removed, and `MOST_MORE` configurations
-        more than before allowed. Unchanged if no pose is left to add.
+        Each with probability 1/2; up to four poses are removed, and the design is filled up to
+        at most `MOST_MORE` configurations more than it had. Unchanged if no pose is left to
+        add. ``chosen``: indices of units.
         """
         pose = self._information.pose
         poses_in = np.unique(pose[np.array(chosen, dtype=np.int64)])
@@ -374,9 +385,11 @@ class _Search:
         return chosen
 
     def _without_least(self, chosen: Sequence[int]) -> list[int]:
-        """Return the design without its least useful unit, floors kept if possible.
+        """Return the design without its least useful unit.
 
-        Least is log criterion + `URGENCY` log robot time of what remains.
+        That is the one without which log criterion + `URGENCY` log robot time is least, among
+        those without which the floors are kept, if any. ``chosen``: indices of two or more
+        units.
         """
         which = np.array(chosen, dtype=np.int64)
         without = [[kept_unit for kept_unit in chosen if kept_unit != index] for index in chosen]

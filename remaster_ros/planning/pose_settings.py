@@ -57,7 +57,7 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
     tool_box: ToolBoxSettings | None = None
 
     def ranges(self) -> PoseRanges:
-        """Return the ranges in SI units. Raises InputError as `PoseRanges`."""
+        """Return the ranges of candidate poses in SI units. Raises InputError as `PoseRanges`."""
         return PoseRanges(
             azimuth_rad=(radians(self.azimuth_deg[0]), radians(self.azimuth_deg[1])),
             radius_m=self.radius_m,
@@ -87,7 +87,7 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def given(self) -> Mapping[str, object]:
-        """Return the keys that differ from their defaults, with values; ranges excepted."""
+        """Return the settings that differ from their defaults, key -> value, without ranges."""
         plain = PoseSettings()
         return {
             key: getattr(self, key)
@@ -96,9 +96,10 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         }
 
     def problem(self) -> str:
-        """First contradiction between keys, as a line with the remedy; '' if there is none.
+        """Sentence on the first problem of the keys, with the remedy; '' if there is none.
 
-        Also a descending range, angles that look like radians, and unknown words.
+        A problem is a descending range, angles that look like radians, an unknown word, or a
+        key that has no effect with the others.
         """
         for key in RANGES:
             low, high = getattr(self, key)
@@ -122,7 +123,10 @@ class PoseSettings(msgspec.Struct, forbid_unknown_fields=True):
         return self._without_effect()
 
     def _without_effect(self) -> str:
-        """First key that has no effect with the others, with the remedy; '' if there is none."""
+        """Sentence on the first key that has no effect with the others, with the remedy.
+
+        '' if there is none.
+        """
         given = self.given()
         if self.solutions == CHOSEN and (self.design, self.order) == (LATIN_HYPERCUBE, NEAREST):
             return (

@@ -31,7 +31,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Cause:
-    """A possible change during a collection."""
+    """A possible change during a collection: of a sensor, the base, a marker, tool or joint."""
 
     kind: str  # ``sensor``, ``base``, ``marker``, ``tool`` or ``joint``
     subject: str  # The change as a sentence
@@ -44,7 +44,7 @@ class Cause:
 def rigid(points: FloatArray, center: FloatArray) -> FloatArray:
     """Return the Jacobian of points (n, 3) by a rigid motion about `center`, (n, 3, 6).
 
-    Columns: translation along x, y, z, then rotation about them, per rad.
+    Columns: translation along x, y, z, then rotation about them, per rad. ``center``: (3,).
     """
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     # Column i: the velocity at a turn about axis i, e_i × (point - center).
@@ -160,12 +160,13 @@ def choose_references(
 def _exchanged(
     chosen: Sequence[int], moves: Sequence[FloatArray], wanted: float
 ) -> tuple[list[int], float]:
-    """Exchange one reference after the other if another shows rigid motions better.
+    """Exchange chosen references, one by one, for candidates that show rigid motions better.
 
-    ``moves``: of each rigid motion the signals of the candidates, (n, 3 S, 6). Returns the
-    references and their smallest singular value; the exchange ends after `MOST_EXCHANGES` rounds,
-    or as soon as that is `wanted`, since the first choice distinguishes the causes best.
-    ``chosen``: indices of the candidates.
+    Returns the new references and their smallest singular value, the least of all rigid
+    motions (`_smallest`). Ends as soon as that is `wanted`, as the first choice distinguishes
+    the causes best, after `MOST_EXCHANGES` rounds, or a round without an exchange. ``chosen``:
+    indices of the references among n candidates; ``moves``: for each rigid motion the
+    displacements of the S markers at the candidates in standard deviations, (n, 3 S, 6).
     """
     best, smallest = list(chosen), min(_smallest(move[list(chosen)]) for move in moves)
     for _ in range(MOST_EXCHANGES):
@@ -184,9 +185,11 @@ def _exchanged(
 
 
 def _smallest(signals: FloatArray) -> float:
-    """Smallest singular value of signals of a rigid motion, (m, 3 S, 6), all-zero rows left out.
+    """Smallest singular value of the displacements by a rigid motion at m references.
 
-    Rotations count about the centre of the references.
+    In standard deviations, for the unit shift or rotation; rotations count about the centre of
+    the references. ``signals``: displacements by 3 translations and 3 rotations, (m, 3 S, 6);
+    rows of zeros, of markers that do not move, are left out.
     """
     flat = signals.reshape(-1, signals.shape[-1])
     flat = flat[np.any(flat != 0.0, axis=1)]
@@ -199,7 +202,7 @@ def _smallest(signals: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen references."""
+    """The chosen reference configurations, and how well they show a rigid motion."""
 
     indices: tuple[int, ...]  # Into the candidates, in the order chosen
     # Size of the least visible shift (0.5 mm) or rotation (1 mrad) of a sensor or the base, in

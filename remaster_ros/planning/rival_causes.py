@@ -49,7 +49,7 @@ class FoundCause:
 
     @classmethod
     def of(cls, effect: FoundEffect) -> FoundCause:
-        """Return a found effect with the look-alikes that measurements can separate from it."""
+        """Return a found effect, with those look-alikes that measurements can separate from it."""
         return cls(
             effect.name,
             effect.joints,
@@ -65,7 +65,7 @@ class FoundCause:
 
 @dataclass(frozen=True, eq=False)
 class Rivals:
-    """A cause of a stated size, and a look-alike of any size."""
+    """A pair of causes: one of a stated size, and a look-alike of any size."""
 
     cause: tuple[Candidate, ...]
     size: FloatArray  # Parameters of the cause, in their units, (m,)
@@ -73,7 +73,7 @@ class Rivals:
 
     @property
     def depends_on_approach(self) -> bool:
-        """Whether a driver of either cause depends on the previous configuration."""
+        """Whether either cause depends on the configuration that the arm came from."""
         return any(
             name in candidate.driver
             for candidate in (*self.cause, *self.look_alike)
@@ -87,10 +87,12 @@ class Rivals:
         return all(name in names for candidate in self.look_alike for name in candidate.parameters)
 
     def columns(self, context: Context) -> ExtraColumns:
-        """Return the amplitude of the cause and the parameters of the look-alike as columns.
+        """Return the parameters for telling the pair apart: amplitude of the cause, look-alike.
 
+        1 + m columns: the amplitude (1 as stated) and the m parameters of the look-alike.
         Priors: `FREE_STD` of the amplitude; of a parameter the largest plausible size of its
-        effect, or what moves the markers by `LARGEST_M` (RMS).
+        effect, or what moves the markers by `LARGEST_M` (RMS). ``context``: conditions of the
+        configurations.
         """
         std = []
         for candidate in self.look_alike:
@@ -105,9 +107,9 @@ class Rivals:
         )
 
     def _displacement(self, context: Context, nominal: Context) -> FloatArray:
-        """Return the displacement of markers per unit of these columns, m, (n, 3, 1 + m).
+        """Return the displacement of markers per unit of the `columns`, m, (n, 3, 1 + m).
 
-        That in `context`; ``nominal`` is not used.
+        Computed in `context`; ``nominal``, which the caller passes, is not used.
         """
         amplitude = _shifts(context, self.cause) @ self.size
         return np.concatenate((amplitude[:, :, None], _shifts(context, self.look_alike)), axis=2)
@@ -116,7 +118,8 @@ class Rivals:
         """Return the reversed pair: the look-alike with the size that imitates the cause best.
 
         ``information``: with the `columns` of this pair; ``measured``: indices of the
-        configurations that are fitted. This pair is not changed.
+        configurations that are fitted. This pair is not changed; its cause of any size is the
+        look-alike of the new one.
         """
         matrix = information.finite(information.total(measured))
         place = information.names.index(AMPLITUDE)
@@ -143,10 +146,11 @@ def rivals_of(
 
 
 def _found_candidates(context: Context, cause: FoundCause) -> tuple[Candidate, ...]:
-    """Return the candidates that have all parameters of a cause between them; () if none.
+    """Return candidates whose parameters together are those of a found cause, each once.
 
-    Found largest first, without a parameter twice; a moment is no parameter. The cause's driver,
-    if it has one, must be the candidate's.
+    Greedy: a candidate with more parameters is taken first. 'moment' (of time) is not counted
+    as a parameter. Only candidates of the cause's name and, if it has a driver, of that
+    driver. () if they do not have all parameters.
     """
     found: list[Candidate] = []
     missing = {name for name in cause.sizes if name != 'moment'}
@@ -163,9 +167,9 @@ def _found_candidates(context: Context, cause: FoundCause) -> tuple[Candidate, .
 
 
 def _largest_candidate(context: Context, name: str, joints: tuple[int, ...]) -> Candidate | None:
-    """Return the variant of an effect with the most parameters; None if there is none.
+    """Return the candidate of an effect and joints with the most parameters; None without any.
 
-    ``name``: of the effect; ``joints``: as of the candidate, 1-based.
+    ``name``: of the effect; ``joints``: those of the candidate, 1-based.
     """
     candidates = [
         candidate for candidate in _candidates(context, name) if candidate.joints == joints
@@ -178,7 +182,8 @@ def _largest_candidate(context: Context, name: str, joints: tuple[int, ...]) -> 
 def _candidates(context: Context, name: str) -> list[Candidate]:
     """Return all candidates of a named effect that this context has data for.
 
-    Those of a moment are left out; [] for an unknown name or ``unnamed``.
+    Those of a change at one moment of time are left out; [] for an unknown name or
+    ``unnamed``.
     """
     effect = EFFECTS.get(name)
     if effect is None or name == 'unnamed' or effect.needs(context):
@@ -192,23 +197,28 @@ def _shifts(context: Context, candidates: Sequence[Candidate]) -> FloatArray:
 
 
 def _rms(shift: FloatArray) -> FloatArray:
-    """Return the root mean square of the displacement of each column (n, 3, m), (m,); 1 for 0."""
+    """Return the RMS length of the displacements of each column, (m,); 1 for a column of zeros.
+
+    ``shift``: displacements of n rows, (n, 3, m).
+    """
     rms: FloatArray = np.sqrt(np.mean(np.sum(shift**2, axis=1), axis=0))
     return np.where(rms > 0.0, rms, 1.0)
 
 
 def separation(information: DesignInformation, chosen: Sequence[int]) -> float:
-    """Return the separation of two causes by chosen configurations, in standard deviations.
+    """Return the separation of a pair of causes by chosen configurations, in standard deviations.
 
-    ``information``: with the columns of `Rivals.columns`; ``chosen``: indices.
+    It is 1 over the standard deviation of the amplitude of the first. ``information``: with
+    the columns of `Rivals.columns`; ``chosen``: indices of configurations.
     """
     return 1.0 / float(np.sqrt(variances(information, information.total(chosen)[None])[0]))
 
 
 def variances(information: DesignInformation, matrices: FloatArray) -> FloatArray:
-    """Return the variance of the amplitude for n information matrices (n, f, f), (n,).
+    """Return the variance of a cause's amplitude for each of n information matrices, (n,).
 
-    With the ridge `UNKNOWN`, so that it is finite.
+    With the ridge `UNKNOWN`, so that it is finite. ``information``: with the columns of
+    `Rivals.columns`; ``matrices``: in its units, (n, f, f).
     """
     place = information.names.index(AMPLITUDE)
     finite = information.finite(matrices)

@@ -164,10 +164,10 @@ def separate(
 
 
 def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
-    """Return the candidates with fewer solutions of each pose, some `MOST_CANDIDATES` in all.
+    """Return candidates with only every n-th solution of each pose, some `MOST_CANDIDATES` in all.
 
-    Every n-th solution of each, begun at another one from pose to pose; poses without any are left
-    out. Unchanged if there are no more.
+    The first of them differs from pose to pose; poses left without any are omitted. All are
+    returned if there are no more than that.
     """
     count = sum(len(pose.solutions) for pose in candidates)
     step = max(1, -(-count // MOST_CANDIDATES))
@@ -181,7 +181,7 @@ def _thinned(candidates: Sequence[PlannedPose]) -> list[PlannedPose]:
 
 @dataclass(eq=False)
 class _Choice:
-    """Choice of configurations for pairs of causes."""
+    """Choice of configurations that separate pairs of a cause and a look-alike."""
 
     chain: SerialChain
     poses: Sequence[PlannedPose]  # Planned ones first, `given` of them
@@ -208,10 +208,11 @@ class _Choice:
             self._from_q[self.done] = self.measured.from_q
 
     def context(self) -> Context:
-        """Return the context of effects, for an arm that comes from its last configuration.
+        """Return the context of effects at all configurations, planned ones and candidates.
 
-        Without `measured` there are no times and moves. New configurations come `BREAK_S` after
-        the last reading, at its temperature.
+        Without `measured` there are no times and previous configurations. With it candidates
+        are `BREAK_S` after the last reading, at its temperature, and come from the arm's last
+        configuration, or from that chosen last.
         """
         context, measured = nominal_context(*self._model, self._rows), self.measured
         if measured is None:
@@ -228,10 +229,10 @@ class _Choice:
         return replace(context, measurements=rows, timed=True)
 
     def add(self, first: str, second: str, rivals: Rivals) -> bool:
-        """Add a pair; return False, and add nothing, if no candidates separate the two.
+        """Add a pair of causes to be separated; return whether it was added.
 
-        They do not if the separation by all candidates is below `HOPELESS`. ``first, second``:
-        causes as text.
+        It is not if the separation by all configurations is below `HOPELESS`. ``first,
+        second``: cause and look-alike as text.
         """
         information = self._information(rivals)
         both: tuple[Rivals, ...] = rivals, rivals.imitation(information, self.done)
@@ -245,7 +246,7 @@ class _Choice:
         return True
 
     def _information(self, rivals: Rivals) -> DesignInformation:
-        """Return the information with the columns of a pair, computed once."""
+        """Return the information of all configurations with the columns of a pair; kept."""
         if rivals not in self._known:
             self._known[rivals] = DesignInformation.of(
                 self.chain,
@@ -258,9 +259,11 @@ class _Choice:
         return self._known[rivals]
 
     def design(self, otherwise: tuple[str, ...]) -> SeparatingDesign:
-        """Return the design: chosen configurations, and the separations before and after.
+        """Choose the configurations that separate the added pairs best; return the design.
 
-        ``otherwise``: sentences on pairs that were not added.
+        One by one until all pairs are separated by `DECIDED` or `most` are chosen; with each
+        pair's separation before and after. ``otherwise``: sentences on pairs that were not
+        added.
         """
         separations = [self._separation(both, self.done) for _, _, both in self._pairs]
         chosen = self._most_separating()
@@ -281,17 +284,19 @@ class _Choice:
         )
 
     def _separation(self, both: tuple[Rivals, ...], chosen: Sequence[int]) -> float:
-        """Return the smaller of the separations in both directions.
+        """Return the smallest separation of a pair, over its one or two directions.
 
-        ``chosen``: indices of the configurations measured.
+        ``both``: the pair, and the reversed one unless it is nested; ``chosen``: indices of
+        the configurations measured.
         """
         return min(separation(self._information(pair), chosen) for pair in both)
 
     def _most_separating(self) -> list[int]:
-        """Return the indices of the most separating configurations, one by one.
+        """Return the indices of the configurations that separate the pairs best, one by one.
 
-        Until all pairs are separated by `DECIDED`, or `most` are chosen. Each has the largest sum
-        of log variance ratios of the undecided pairs.
+        Until all pairs are separated by `DECIDED`, or `most` are chosen. Each is the candidate
+        with the largest sum, over the undecided pairs, of the log ratio of the amplitude's
+        variance before and with it.
         """
         chosen: list[int] = []
         remaining = np.arange(len(self.done), len(self.q))
@@ -322,10 +327,10 @@ class _Choice:
     def _approach_from(
         self, q: FloatArray, remaining: IntArray, directions: Sequence[Rivals]
     ) -> None:
-        """Set the previous configuration of all remaining ones to q, rad or m, (k,).
+        """Set the previous configuration of all remaining candidates to q, rad or m, (k,).
 
-        The information of pairs that depend on it is computed anew. Nothing without `measured`.
-        ``directions``: all pairs.
+        The kept information of pairs that depend on it is dropped, to be computed anew.
+        Nothing without `measured`. ``remaining``: indices; ``directions``: all pairs.
         """
         if self.measured is not None:
             self._from_q[remaining] = q

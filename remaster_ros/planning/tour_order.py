@@ -30,7 +30,7 @@ FIRST_ROUNDS = 2
 
 
 class Route(NamedTuple):
-    """The paths to joint solutions of one pose, in the order of the visits."""
+    """The joint solutions of one pose in the order of visiting, and the paths to them."""
 
     ids: Sequence[int]  # Indices into the pose's planned solutions
     # Waypoints from the previous solution to each (to the first from the arm's configuration),
@@ -43,7 +43,10 @@ class Route(NamedTuple):
 
 @dataclass(frozen=True)
 class PoseVisit:
-    """A visit to a pose: its number, its joint solutions in order, and the paths to them."""
+    """A visit to a pose: its number, its joint solutions in order, and the paths to them.
+
+    Without ``paths`` each path is a straight line.
+    """
 
     # Number of the pose in the session; those of registration poses are negative
     pose: int
@@ -178,7 +181,10 @@ class Tour:
         return self._restarted(self.plans, None)
 
     def _restarted(self, plans: Mapping[str, Plan], model: CollisionModel | None) -> Tour:
-        """Return a new tour with other plans and model, and the options of this one."""
+        """Return a new tour with other plans and collision model, and the options of this one.
+
+        No pose is visited.
+        """
         return Tour(
             self.chain,
             plans,
@@ -230,13 +236,14 @@ class Tour:
         return unvisited[0 if self.in_order else int(np.argmin(distances))]
 
     def _in_order(self) -> list[tuple[str, int, int]]:
-        """Return the visits of the given order that are not done."""
+        """Return the visits of `order` that are not done: split, pose and solution of each."""
         return [v for v in self.order if v[2] in self._unvisited[v[0]].get(v[1], ())]
 
     def _due(self, split: str, index: int) -> list[int]:
-        """Return the solutions of a pose to visit now: all, or those consecutive in the order.
+        """Return the solutions of a pose to visit now, as indices of those not visited.
 
-        Indices, of those not visited.
+        All of them; of a tour with a given order those that follow one another in it.
+        ``split, index``: of the pose, which in such a tour is next.
         """
         if not self.order:
             return self._unvisited[split][index]
@@ -257,7 +264,10 @@ class Tour:
             self._reference, self._rounds_due = 0, max(self._rounds_due, 1)
 
     def _propose_reference(self, q: FloatArray) -> PoseVisit:
-        """Return the visit to the next reference."""
+        """Return the visit to the next reference of the round; nothing is counted.
+
+        ``q``: where the arm is, rad or m, (k,). Without a path the visit has no solution.
+        """
         index = self._reference
         return self._visit(REFERENCE, index, self._route(REFERENCE, index, [0], q))
 
@@ -291,7 +301,10 @@ class Tour:
         return self.record_visit(p.split, p.index, p.ids, p.paths, p.unreached, p.shares)
 
     def reroute(self, visit: PoseVisit, q: FloatArray) -> PoseVisit:
-        """Return a visit with new paths to its solutions, and their new order, from q."""
+        """Return a visit to the same solutions, with new paths and order from configuration q.
+
+        ``q``: rad or m, (k,). Solutions without a path become `unreached`; nothing is counted.
+        """
         return self.with_route(visit, *self._route(visit.split, visit.index, visit.ids, q))
 
     def with_route(
@@ -315,12 +328,13 @@ class Tour:
         unreached: Sequence[int] = (),
         shares: Sequence[FloatArray] = (),
     ) -> PoseVisit:
-        """Count a visit to a planned pose as made, and return it; `Route` has the arguments.
+        """Count a visit to a planned pose as made, and return it.
 
-        Of a tour without an order all solutions of the pose are done then, else those of the
-        route. A tour is resumed by calling this for all visits made so far, in their order. Raises
-        KeyError for a pose that is done already. ``split, index``: the pose's plan, and its index
-        there.
+        ``split, index``: the pose's plan, and its index there; the other arguments are those
+        of `Route`. Without a given order all solutions of the pose are done then, else those
+        of the route. A tour is resumed by calling this for all visits made so far, in their
+        order.
+        Raises KeyError for a pose that is done already.
         """
         visit = self._visit(split, index, Route(ids, paths, unreached, shares))
         if split == REFERENCE:
@@ -351,7 +365,7 @@ class Tour:
                 self.poses[split] -= 1
 
     def has_unvisited(self, split: str) -> bool:
-        """Whether visits of a split remain."""
+        """Whether visits of a split remain; False for a split that is not planned."""
         return bool(self._unvisited.get(split))
 
     def _begin_reference(self, index: int) -> None:
@@ -391,10 +405,11 @@ class Tour:
         )
 
     def _route(self, split: str, index: int, ids: Iterable[int], q: FloatArray) -> Route:
-        """Return the route to solutions of a pose, in the order of `free_order`.
+        """Return the route to solutions of a pose from configuration q; nothing is counted.
 
-        ``ids``: indices into the pose's solutions; those without a path are in `unreached`. The
-        same arguments give the same route.
+        To a reference as `_route_to_reference`; along the pose's curve if the arm is at its
+        begin; else in the order of `free_order`. ``ids``: indices into the pose's solutions;
+        those without a path are in `unreached`. The same arguments give the same route.
         """
         ids = list(ids)
         if split == REFERENCE:
@@ -437,9 +452,10 @@ def nearest_solution(
 ) -> int | None:
     """Return the index of the solution (m, k) at which the arm stands; None if there is none.
 
-    All joints must agree within the tolerance, rad (of a slide as `units` count it), without whole
-    turns; of several the nearest. It is ten times what the bridge accepts as arrived by default,
-    and far below the difference between two solutions of a pose. Raises ValueError if m is 0.
+    All joints must agree within the tolerance, rad (of a prismatic joint by `units`); turns by
+    2 pi differ. If several do, the nearest. The default is ten times what the bridge accepts
+    as arrived by default, and far below the difference between two solutions of a pose. Raises
+    ValueError if m is 0. ``q``: configuration of the arm, (k,).
     """
     distance = np.max(np.abs(solutions - q) / units.per_radian, axis=1)
     nearest = int(np.argmin(distance))

@@ -165,7 +165,7 @@ class TourPlanner:
 
     @property
     def rough_places(self) -> dict[str, FloatArray]:
-        """T_R_N of each sensor at its rough position, (4, 4)."""
+        """Transform T_R_N of each sensor at its rough position, unrotated, name -> (4, 4)."""
         return {name: transform(np.eye(3), at) for name, at in self.scene.rough_R.items()}
 
     @property
@@ -193,7 +193,7 @@ class TourPlanner:
 
     @property
     def usable_to_fit(self) -> int:
-        """Number of usable poses to fit, for sensors at their rough positions."""
+        """Number of usable poses to fit among the candidates, for sensors at rough positions."""
         return len(self._plan('optimization', self.scene.rough_R).poses)
 
     def collection(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
@@ -258,10 +258,11 @@ class TourPlanner:
         )
 
     def prepare(self) -> None:
-        """Choose the curves of `moving` for sensors at their rough positions, ahead of it.
+        """Choose the curves of `moving` ahead, for sensors at their rough positions.
 
-        That takes half a minute. They are taken where registered sensors see them as well; where
-        none are found, `moving` says why. Nothing for stop and go.
+        That takes half a minute. `moving` uses them if the registered sensors see all markers
+        along them; if none are found, nothing is raised here, and `moving` says why. Nothing
+        without `moving_s`.
         """
         if not self.moving_s:
             return
@@ -276,9 +277,9 @@ class TourPlanner:
     def _curves(
         self, sensors_R: Mapping[str, FloatArray], scene: PlanningScene | None = None
     ) -> MovingDesign:
-        """Return curves for sensors at these positions in R, m, (3,); as `design_moving`.
+        """Return curves for sensors at positions in the robot base frame R, m, (3,) each.
 
-        ``scene``: None for that of this planner.
+        ``scene``: None for that of this planner. Raises as `design_moving`.
         """
         rng = np.random.default_rng([self._seed, *b'moving'])
         seconds = self.moving_s or MOVING_S
@@ -293,9 +294,10 @@ class TourPlanner:
         )
 
     def _likely_end(self) -> FloatArray:
-        """Return where an arm that begins in the middle ends its registration, rad or m, (k,).
+        """Return the configuration at the end of a likely registration, rad or m, (k,).
 
-        The middle if this planner plans none.
+        It begins at 0, cut to the joint limits, and visits the first three poses by straight
+        paths. Without a registration the begin itself.
         """
         q: FloatArray = np.clip(np.zeros(len(self._chain)), self._chain.lower, self._chain.upper)
         if self.registers:
@@ -305,9 +307,9 @@ class TourPlanner:
         return q
 
     def _separating(self, plan: Plan, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        """Return a plan with configurations added that separate the causes.
+        """Return the plan of poses to fit with poses added that separate the planner's causes.
 
-        Sets `separating_design`.
+        ``sensors_R``: positions in the robot base frame R, m, (3,). Sets `separating_design`.
         """
         rng = np.random.default_rng([self._seed, *b'separate'])
         pool = scene_with_other_elbows(self.scene).plan(POOL_CANDIDATES, sensors_R, rng)
@@ -415,7 +417,7 @@ class TourPlanner:
     def _reachable(self, poses: list[PlannedPose]) -> list[PlannedPose]:
         """Return `VERIFIED_POSES` of the poses in an order with a path from each to the next.
 
-        Fewer if not enough can be reached.
+        Fewer, down to none, if not enough can be reached. Each pose has one solution.
         """
         while True:
             q = np.array([pose.solutions[0] for pose in poses[:VERIFIED_POSES]])
@@ -426,9 +428,10 @@ class TourPlanner:
             poses = [pose for pose in poses if all(pose is not each for each in unreachable)]
 
     def _references(self, plans: Mapping[str, Plan]) -> Plan:
-        """Return references among planned configurations, with a path from each to the next.
+        """Return a plan of references, chosen among the configurations of plans.
 
-        After `MOST_TRIES` choices as they are, with or without paths.
+        In an order with a free path from each to the next; if `MOST_TRIES` choices have none,
+        the last choice as it is.
         """
         poses = [
             PlannedPose(pose.T_R_T, q[None])
@@ -449,9 +452,10 @@ class TourPlanner:
         return Plan(tuple(chosen))
 
     def _nearest_order(self, q: FloatArray, indices: list[int]) -> list[int]:
-        """Return indices into q (n, k) in nearest-neighbour order, from the first one on.
+        """Return indices of configurations in nearest-neighbour order, from the first one on.
 
-        Nearest by travel time, see `order_solutions`; [] for no indices.
+        Nearest by travel time, see `order_solutions`. ``q``: configurations, (n, k);
+        ``indices``: into q; [] gives [].
         """
         order = indices[:1]
         while remaining := [i for i in indices if i not in order]:
@@ -460,7 +464,10 @@ class TourPlanner:
         return order
 
     def _unreachable(self, poses: Sequence[PlannedPose]) -> list[PlannedPose]:
-        """Return the poses without a free path from the one before, to the first from the last."""
+        """Return the poses to which there is no free path from the one before.
+
+        The first one counts as coming after the last. Each pose has one solution.
+        """
         limits = self._chain.velocity_limits
         return [
             pose
@@ -470,7 +477,10 @@ class TourPlanner:
         ]
 
     def _plan(self, split: str, sensors_R: Mapping[str, FloatArray]) -> Plan:
-        """Return the plan of a split from its candidates, always the same for the same sensors."""
+        """Return the plan of a split from its candidates; the same arguments give the same plan.
+
+        ``sensors_R``: position in R of each sensor that has to see its marker, m, (3,).
+        """
         # Seeded by the split: the plan does not depend on what was planned before a restart.
         rng = np.random.default_rng([self._seed, *split.encode()])
         return self.scene.plan(self._counts[split], sensors_R, rng)

@@ -35,7 +35,7 @@ SAMPLES = 5
 
 @dataclass(frozen=True, eq=False)
 class TravelTime:
-    """Model of the time that motion and measuring take."""
+    """Model of the time that an arm's motion, settling and measuring take."""
 
     limits: MotionLimits  # Speeds and accelerations of the bridge
     speeds: PointSpeeds  # Of the fastest point of arm and tool
@@ -105,7 +105,7 @@ class TravelTime:
         return np.array([self.straight(start, q) for start in q])
 
     def along(self, points: FloatArray) -> float:
-        """Return the time along a polyline (n + 1, k), with the stops at its corners, s."""
+        """Return the travel time along a polyline (n + 1, k), rad or m, stopping at corners, s."""
         return self.trajectory(points)[0].duration_s
 
     def trajectory(self, points: FloatArray) -> tuple[Trajectory, float]:

@@ -60,10 +60,10 @@ def _nearest(times: FloatArray) -> list[int]:
 
 
 def _reverse(times: FloatArray, order: list[int]) -> bool:
-    """Reverse the part of the order that gains most, ends excepted; return whether any gains.
+    """Reverse the part of an order whose reversal saves most time; return whether any does.
 
-    ``order``: changed in place; a gain counts from 1e-9 s on. ``times``: between all places, s,
-    (n, n).
+    The first and last place stay. ``order``: changed in place; a saving counts from 1e-9 s on.
+    ``times``: between all places, s, (n, n).
     """
     at = np.array(order)
     # Times of the part from i to j: entry from i - 1, exit to j + 1.
@@ -80,10 +80,11 @@ def _reverse(times: FloatArray, order: list[int]) -> bool:
 
 
 def _move(times: FloatArray, order: list[int]) -> bool:
-    """Move the part of the order that gains most; return whether any move gains.
+    """Move the part of an order whose move saves most time; return whether any move does.
 
-    Up to `LONGEST_MOVED` places, also reversed; ends stay. ``order``: changed in place; a gain
-    counts from 1e-9 s on. ``times``: between all places, s, (n, n).
+    A part is up to `LONGEST_MOVED` places, also reversed; the first and last place stay.
+    ``order``: changed in place; a saving counts from 1e-9 s on. ``times``: between all places,
+    s, (n, n).
     """
     best, move = 1e-9, None
     for size in range(1, LONGEST_MOVED + 1):
@@ -158,10 +159,11 @@ def visit_order(
 def _is_free(
     model: CollisionModel, q: FloatArray, times: FloatArray, first: range, second: range
 ) -> bool:
-    """Whether the straight path between the nearest pair of two places is free.
+    """Whether the straight path between two places is free of collisions.
 
-    ``times``: between all visits, s, (n, n); ``first, second``: their visits, indices into q (n,
-    k).
+    A place is one visit or several of a pose; the path is between the two nearest. ``q``:
+    configurations of all visits, (n, k); ``times``: between all visits, s, (n, n); ``first,
+    second``: the visits of each place, as indices into q.
     """
     between = times[first.start : first.stop, second.start : second.stop]
     a, b = np.unravel_index(int(np.argmin(between)), between.shape)

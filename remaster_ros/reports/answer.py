@@ -26,7 +26,7 @@ ALL_FILES = (REMASTER_FILE, URDF_FILE, LAYER_FILE, MODEL_FILE)
 
 
 class Stage(NamedTuple):
-    """3-D errors of the judged rows at one stage of correction, mm."""
+    """3-D errors of the rows by which a report judges, mm, with some errors corrected."""
 
     title: str  # Parts that are corrected
     errors: FloatArray  # Errors of the judged rows, mm, (m,)
@@ -48,7 +48,7 @@ class Stage(NamedTuple):
 
 
 class SensorNoise(NamedTuple):
-    """Mean 3-D error due to a sensor's noise, mm."""
+    """Mean length of a reading's 3-D error due to a sensor's noise alone, mm."""
 
     sensor: str
     reading_mm: float  # Noise of one reading
@@ -58,7 +58,7 @@ class SensorNoise(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Content of the first screen."""
+    """Answer of a report: what to do (action), how much it gains, and which errors remain."""
 
     # Judgement: 'good' if held-out poses confirm all of it
     mood: Mood
@@ -83,9 +83,9 @@ class Answer:
 
     @property
     def plain_pad(self) -> bool:
-        """Whether the pad counts the joints as the URDF, and each is set where it shows 0.
+        """Whether each joint is set alone, at the pad's 0, and the pad counts as the URDF does.
 
-        True also if there is nothing to set.
+        True also if there is nothing to set. Pad: the robot's teach pendant.
         """
         return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
@@ -96,9 +96,9 @@ class Answer:
 
     @property
     def left_alone(self) -> list[str]:
-        """Names on the pad of the joints to leave as they are, whose offsets are unknown.
+        """Names, on the teach pendant, of the joints not to be set as their offset is unknown.
 
-        'A4 (joint_4)' if the pad's name differs from the URDF's.
+        'A4 (joint_4)' if that name differs from the URDF's; [] if there are none.
         """
         set_joints = {step.joint for group in self.on_the_pad for step in group}
         return [
@@ -110,18 +110,21 @@ class Answer:
 
     @property
     def files(self) -> list[str]:
-        """Names of the files in the folder ``apply`` for the action; [] unless it is 'set'."""
+        """Names of the files in the folder ``apply`` for the action; [] unless it is 'set'.
+
+        The robot model is among them only if `loads_model`.
+        """
         if self.action != 'set':
             return []
         return [name for name in ALL_FILES if self.loads_model or name != MODEL_FILE]
 
 
 def answer_of(inputs: Inputs) -> Answer:
-    """Action, gain and remaining errors for a session and its results.
+    """Return action, gain and remaining errors for a session and its results.
 
-    The stages are the errors today, with offsets, and with what further can be used: causes, if
-    all are errors of the measurement that are taken out, or a robot model, if it makes the mean
-    error clearly smaller (`NOTICEABLE_GAIN`). The rows judged are those of `judged_rows`.
+    The stages are the errors today, with offsets, and with what further can be used: causes,
+    if all are errors of the measurement that are taken out, or a robot model, if it makes the
+    mean error clearly smaller (`NOTICEABLE_GAIN`). The rows judged are those of `judged_rows`.
     """
     fit, found = inputs.fit, inputs.found
     effects = found.effects if found is not None else []
@@ -177,7 +180,10 @@ def answer_of(inputs: Inputs) -> Answer:
 def _on_the_pad(
     session: Session, offsets: Sequence[JointOffset]
 ) -> tuple[tuple[MasteringStep, ...], ...]:
-    """Steps on the pad for the offsets of a session, in groups of coupled joints."""
+    """Return the mastering steps on the teach pendant for offsets, in groups of coupled joints.
+
+    ``offsets``: of each joint of the session's arm, in order.
+    """
     return mastering(
         session.controller,
         SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link),
@@ -236,10 +242,11 @@ def _action(
     after: float,
     offsets: list[JointOffset],
 ) -> tuple[Literal['set', 'wait', 'nothing'], str]:
-    """Action, and a sentence with the reason if it is not to set the offsets, else ''.
+    """Return the action, and a sentence with the reason unless it is 'set', else ''.
 
-    'wait' for a bad judgement or a cause of the arm that came at a moment; 'nothing' without an
-    identifiable offset or a gain of 10 % (`NOTICEABLE_GAIN`). ``before, after``: mean errors, mm.
+    'wait' for a bad judgement, or a cause of the arm that happened at a moment; 'nothing'
+    without an identifiable offset, or if the mean error before is below `NOTICEABLE_GAIN`
+    (1.1) times that after. ``before, after``: mean errors, mm.
     """
     if judgement.mood == 'bad':
         return 'wait', f'Set nothing yet. {judgement.headline}'
@@ -261,9 +268,9 @@ def _action(
 
 
 def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
-    """Noise by sensor: of the model with causes if there is one, else that assumed by the fit.
+    """Return the noise of each sensor, those of unknown noise left out.
 
-    Sensors whose noise is unknown are left out.
+    As estimated with the causes if there is a discovery, else as the fit assumes it.
     """
     rows: list[SensorNoise] = []
     if inputs.found is not None and isinstance(inputs.found.noise.sensors, dict):
@@ -286,9 +293,11 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
 
 
 def _mood(inputs: Inputs, loads_model: bool, may_be_good: bool) -> Mood:
-    """Judgement: 'good' only if the fit, the discovery and the held-out poses all agree.
+    """Return the mood of a report: 'good', 'caution' or 'bad'.
 
-    ``may_be_good``: whether poses were held out and the action is not to wait.
+    'bad' if the fit's is; 'good' only if fit and discovery are good, no data disagree, and
+    there are no causes but those in a robot model to be loaded. ``may_be_good``: whether poses
+    were held out and the action is not to wait; else it is 'caution' at best.
     """
     fit, found = inputs.judgement, inputs.found
     if fit.mood == 'bad':
@@ -316,11 +325,11 @@ def _headline(
     loads_model: bool,
     gross: int,
 ) -> str:
-    """Sentence with the action and its gain.
+    """Return a sentence on the action and how much smaller it makes the mean error.
 
-    ``joints``: number of identifiable ones; ``brings``: index of the stage that the action
-    reaches; ``measured``: titles of the measurement's errors; ``gross``: number of held-out gross
-    errors that are not counted.
+    ``joints``: number of identifiable offsets; ``brings``: index of the stage that the action
+    reaches; ``measured``: titles of the measurement's errors; ``gross``: number of held-out
+    gross errors that are not counted.
     """
     before, after = stages[0], stages[brings]
     action = f'Set the zero-offset{"s" if joints > 1 else ""} of {counted(joints, "joint")}'

@@ -43,7 +43,7 @@ LETTERS = 'ABCDEFGHIJKLMNOPQRSTUVWXYZ'
 
 
 class Subject(NamedTuple):
-    """Data that the figures of a report show."""
+    """Session with results, answer and arm that the figures of a report are drawn from."""
 
     inputs: Inputs
     answer: Answer
@@ -51,9 +51,9 @@ class Subject(NamedTuple):
 
 
 def draw_answer(subject: Subject) -> dict[str, str]:
-    """All figures of a report as SVG text, by name without ending: stages, session, workspace.
+    """Draw all figures of a report; return them as SVG text by name.
 
-    'plan' as well if the session has a plan.
+    Names: 'stages', 'session', 'workspace', and 'plan' if the session has a plan.
     """
     figures: dict[str, Callable[[Subject], Figure]] = {
         'session': over_session,
@@ -65,7 +65,7 @@ def draw_answer(subject: Subject) -> dict[str, str]:
 
 
 def draw_stages(answer: Answer) -> dict[str, str]:
-    """Figure of the errors by stage as SVG text, by its name 'stages'."""
+    """Draw the figure of the errors by stage; return {'stages': SVG text}."""
     return as_svg({'stages': stages}, answer)
 
 
@@ -144,7 +144,7 @@ def over_session(subject: Subject) -> Figure:
 
 
 def _mark_moments(ax: Axes, subject: Subject) -> None:
-    """Mark the moments of causes that came at once by dashed lines with their titles."""
+    """Mark by dashed lines with their titles when causes happened that came at one moment."""
     found = subject.inputs.found
     for effect in found.effects if found is not None else ():
         if effect.moment_s is None:
@@ -209,9 +209,10 @@ def workspace(subject: Subject) -> Figure:
 
 
 def planned(subject: Subject) -> Figure:
-    """Draw planned tool positions from above and from the side, and how they ended.
+    """Draw the planned tool positions from above and from the side, coloured by their outcome.
 
-    The session has to have a plan. A pose is 'not measured' if none of its solutions was recorded.
+    The session has to have a plan. A pose is 'not measured' if none of its solutions was
+    recorded.
     """
     from remaster_ros.planning.tour_order import FITTED, REFERENCE
 
@@ -257,10 +258,10 @@ def planned(subject: Subject) -> Figure:
 def two_views(
     figure: Figure, everything: FloatArray, frames: dict[str, FloatArray]
 ) -> list[tuple[Axes, tuple[int, int]]]:
-    """Panels from above and from the side, with the sensors, each with its two axes (indices).
+    """Make two panels of a figure, from above and from the side, with the sensors drawn.
 
-    ``everything``: points that must be inside, in the robot base, m, (n, 3); ``frames``: T_R_N by
-    sensor.
+    Returns each panel with the indices of its two axes of the robot base. ``everything``:
+    points that must be inside, in the robot base, m, (n, 3); ``frames``: T_R_N by sensor.
     """
     middle = 0.5 * (everything.min(axis=0) + everything.max(axis=0))
     reach = 0.55 * float(np.ptp(everything, axis=0).max())
@@ -280,12 +281,15 @@ def two_views(
 
 
 def _with_room() -> ConstrainedLayoutEngine:
-    """Layout for figures with a title on top: printers draw letters a little higher."""
+    """Return a layout with more room at the top, as printers draw letters a little higher."""
     return ConstrainedLayoutEngine(h_pad=0.1)
 
 
 def sensor_entries(frames: dict[str, FloatArray]) -> list[Line2D]:
-    """Legend entries of `two_views` for the sensors: letter, name and distance from the base."""
+    """Return legend entries for the letters by which `two_views` marks sensors.
+
+    Letter, name and distance from the base. ``frames``: T_R_N by sensor, in the same order.
+    """
     labels = [
         f'{letter}: {name[:24]}, {np.linalg.norm(T[:3, 3]):.1f} m from the base'
         for letter, (name, T) in zip(LETTERS, frames.items(), strict=False)
@@ -300,9 +304,10 @@ def _sensors(
     reach: float,
     plane: tuple[int, int],
 ) -> None:
-    """Draw each sensor's letter at its position, or an arrow to one outside the panel.
+    """Draw each sensor's letter at its position, or an arrow towards one outside the panel.
 
-    ``middle``: of the panel in R, (3,), m; ``reach``: half its width, m; ``plane``: its two axes.
+    ``middle``: centre of the panel in the robot base, m, (3,); ``reach``: half its width, m;
+    ``plane``: indices of its two axes.
     """
     for letter, T in zip(LETTERS, frames.values(), strict=False):
         centre = middle[list(plane)]
@@ -328,7 +333,7 @@ def _sensors(
 
 
 def _two_lines(text: str) -> str:
-    """Title broken near its middle; one of fewer than three words is unchanged."""
+    """Return a title with a line break near its middle; unchanged if it has under three words."""
     words = text.split(' ')
     if len(words) < 3:
         return text

@@ -29,7 +29,7 @@ FEW = 5
 
 
 def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Summary over all rows.
+    """Return the summary of many sessions for the page and the terminal.
 
     Parameters
     ----------
@@ -39,7 +39,8 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``counts`` by status; ``joints``: one of each joint of each kind of arm; ``lines`` of text.
+        ``counts``: number of rows by status; ``joints``: a row for each joint of each kind of arm;
+        ``lines``: text on sessions that differ, changes, checks and errors.
     """
     counts: dict[str, int] = defaultdict(int)
     arms: dict[tuple[str, tuple[str, ...]], list[Mapping[str, Any]]] = defaultdict(list)
@@ -99,7 +100,11 @@ def differing(values: FloatArray, level: float) -> list[int]:
 
 
 def _shown(joint: Mapping[str, Any], key: str) -> str:
-    """Value of a joint with sign and unit, four decimals; ``key`` as in 'median', without unit."""
+    """Return a joint's value with sign and unit: '+0.0123 deg'.
+
+    ``joint``: a row of `_joint`; ``key``: name of the value without its unit, such as
+    'median'.
+    """
     return f'{joint[key + "_" + joint["unit"]]:+.4f} {joint["unit"]}'
 
 
@@ -108,9 +113,9 @@ def _joint(
 ) -> dict[str, Any]:
     """Row of a joint for the page: median, spread, sessions that differ, lasting change.
 
-    None for what is unknown; fewer than 5 sessions (`FEW`) have median and spread alone.
-    ``index``: of the joint in each row, from 0; ``rows``: done sessions of one kind of arm;
-    ``level``: of `differing`.
+    Values are None, and lists and texts empty, if unknown; with fewer than `FEW` sessions only
+    median and spread are known. ``index``: of the joint in each row, from 0; ``rows``: done
+    sessions of one kind of arm; ``level``: of `differing`.
     """
     unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
     known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]
@@ -138,7 +143,10 @@ def _joint(
 
 
 def _fit_shown(row: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Fit of a row, without the advice to search for causes if that was done; None if absent."""
+    """Return the fit of a row, without the advice to search for causes if that was done.
+
+    A copy then; None if the row has no fit.
+    """
     fit = row.get('fit')
     if not fit or 'discovery' not in row:
         return fit
@@ -150,8 +158,8 @@ def write_batch_page(
 ) -> None:
     """Write the page of many sessions; an existing file is replaced.
 
-    ``rows``: rows of rows.jsonl; ``over_all``: of `summary_of`. Raises DiskError if the file
-    cannot be written.
+    ``rows``: rows of rows.jsonl; ``over_all``: result of `summary_of`. Raises DiskError if the
+    file cannot be written.
     """
     shown = [
         {

@@ -24,10 +24,12 @@ def write_check_page(
     series_m: FloatArray,
     names: list[str],
 ) -> None:
-    """Write the page.
+    """Write the page of the checks of an arm to a file.
 
     Parameters
     ----------
+    path
+        The file; replaced if it exists.
     content
         Output of ``remaster check --json``.
     series_m
@@ -49,9 +51,10 @@ def write_check_page(
 
 
 def _draw(trend: Trend) -> Figure:
-    """Figure of each joint's change over the checks, at the tool, mm.
+    """Draw each joint's change over the checks, at the tool, mm.
 
-    Only joints whose change could be detected have a panel.
+    ``trend``: content, changes and names of the checks, as of `write_check_page`. Only joints
+    whose change could be detected have a panel.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

@@ -51,14 +51,14 @@ PLACE = 0.01
 
 
 def draw_discovery(discovery: Discovery) -> dict[str, str]:
-    """All figures of a discovery as SVG text, by file name without ending."""
+    """Draw all figures of a discovery; return them as SVG text by file name without ending."""
     return as_svg(discovery_figures(discovery), discovery)
 
 
 def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], Figure]]:
-    """Function that draws each figure of a discovery, by file name without ending.
+    """Return the functions that draw a discovery's figures, by file name without ending.
 
-    'causes' only if there are any.
+    'causes' is among them only if the discovery has causes.
     """
     figures: dict[str, Callable[[Discovery], Figure]] = {'gain': gain, 'drivers': drivers}
     if discovery.groups:
@@ -67,7 +67,10 @@ def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], F
 
 
 def gain(discovery: Discovery) -> Figure:
-    """Draw the errors before and after, and the noise that the readings of a pose share."""
+    """Draw the error distributions before and after, and each sensor's noise.
+
+    Noise that the readings of a pose share is apart from that within a pose, if it is known.
+    """
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     data = discovery.residuals
@@ -191,7 +194,7 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 
 
 def causes(discovery: Discovery) -> Figure:
-    """Draw each cause of a joint, or of a moment: residuals without it, and the fit with its band.
+    """Draw each cause of a joint, and each step of anything else, with the data it explains.
 
     At most 16 panels (twice `MOST_CAUSES`). The sizes of all other causes are in one panel.
     """
@@ -221,7 +224,10 @@ def causes(discovery: Discovery) -> Figure:
 
 
 def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> None:
-    """Draw the sizes of the causes without a curve, RMS at the marker, mm, and the noise."""
+    """Draw the sizes of causes that have no panel of their own, and the noise, as bars.
+
+    RMS at the marker, mm.
+    """
     sizes = [1e3 * effect.size_m for effect in effects]
     noise = 1e3 * discovery.gain.noise_floor_m
     y = np.arange(len(sizes) + 1)
@@ -237,14 +243,20 @@ def _sizes(ax: Axes, discovery: Discovery, effects: Sequence[FoundEffect]) -> No
 
 
 def _estimate(discovery: Discovery, candidate: Candidate) -> FloatArray:
-    """Parameters (p,) of a cause in the whole model, perhaps those of a larger candidate."""
+    """Return the estimate of a candidate's parameters in the discovery's model, (p,).
+
+    Looked up by name: they may belong to a larger candidate there.
+    """
     solution = discovery.solution
     names = [name for member in solution.candidates for name in member.parameters]
     return solution.parameters[[names.index(name) for name in candidate.parameters]]
 
 
 def _step(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
-    """Draw a jump of a sensor, marker or base over time, along its direction, mm."""
+    """Draw a step of a sensor, marker or base over time: errors and fit along its direction, mm.
+
+    The band is ± 2 standard deviations.
+    """
     data, solution = discovery.residuals, discovery.solution
     context = data.part
     columns = candidate.columns(context).displacement(context)
@@ -278,10 +290,10 @@ def _step(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
 def _driver(
     context: Context, candidate: Candidate, features: FloatArray
 ) -> tuple[str, FloatArray, float]:
-    """Label and values (n,) of a cause's driver, and the driver's value for one shown unit.
+    """Return label, values (n,) and shown unit of the quantity that a cause depends on.
 
-    A driver of several numbers is drawn by the feature of the cause's first parameter, features
-    being (n, p).
+    The unit is the value that counts as one of the shown. If the quantity has several numbers,
+    the values are the first column of ``features``, (n, p), those of the cause's parameters.
     """
     driver = driver_named(context, candidate.driver, candidate.joints[-1])
     if driver is None:
@@ -381,10 +393,10 @@ def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
 def _at_places(
     ax: Axes, at: FloatArray, middle: FloatArray, spread: FloatArray, holes: IntArray
 ) -> None:
-    """Draw an estimate and its band where a joint stood only at single places, such as a rail.
+    """Draw an estimate and its band as bars, for a joint that stood only at single places.
 
-    ``at``: driver of the rows, sorted, in parts that begin at ``holes``. Draws nothing if any part
-    is wide enough for a line and a band.
+    ``at``: driver of the rows, sorted, in parts that begin at ``holes``. Draws nothing if any
+    part is wide enough for a line and a band.
     """
     parts = np.split(np.arange(len(at)), holes)
     if any(np.ptp(at[part]) > PLACE * np.ptp(at) for part in parts):
@@ -401,9 +413,10 @@ def _sides(
     band: FloatArray,
     shown: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Draw a step at x = -1 and 1: points spread out, and the level of each side, ± ``band``.
+    """Draw a cause that depends on the side of approach (1 or -1): points, and level ± ``band``.
 
-    ``shown``: places and values of the points.
+    ``x``, ``effect``, ``band``: side, effect and half width in each row; ``shown``: sides and
+    values of the points.
     """
     places, points = shown
     spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))

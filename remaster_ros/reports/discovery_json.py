@@ -46,7 +46,7 @@ def _with_exact_drawing(
 
 
 def predictions_of(discovery: Discovery) -> Predictions:
-    """Predictions of the final model for each row of the session, held-out rows as well."""
+    """Predict every row of the session, held-out rows as well, by the sampled fit."""
     context = discovery.residuals.context
     return predict(discovery.fit, context.measurements)
 
@@ -57,9 +57,10 @@ def discovery_content(
     predictions: Predictions | None = None,
     decided: Sequence[Decision] = (),
 ) -> Discovered:
-    """Checked content of discovery.json, as an object; predictions are computed if not given.
+    """Return the content of discovery.json, checked against its schema.
 
-    ``confirmation``: by another session; ``decided``: decisions between causes and look-alikes.
+    ``confirmation``: by another session; ``predictions``: computed if None; ``decided``:
+    decisions between causes and look-alikes.
     """
     predictions = predictions_of(discovery) if predictions is None else predictions
     fit = estimates(discovery.fit)
@@ -113,10 +114,10 @@ def discovery_content(
 
 
 def _covariance(discovery: Discovery) -> dict[str, Any]:
-    """Posterior covariance of identifiable offsets and of the named causes' parameters.
+    """Return the posterior covariance of identifiable offsets and the named causes' parameters.
 
-    Keys names, units and matrix (six figures). compensation.json has that of all terms of the
-    model.
+    Keys: names, units and matrix (to six significant digits). compensation.json has that of
+    all terms of the model.
     """
     fit = discovery.fit
     units = {n: c.unit for group in discovery.groups for c in group for n in c.parameters}
@@ -135,7 +136,10 @@ def _covariance(discovery: Discovery) -> dict[str, Any]:
 
 
 def _regions(discovery: Discovery, predictions: Predictions) -> dict[str, Any]:
-    """Share of held-out and fitted rows, without gross errors, in their predicted 95 % regions."""
+    """Return the shares of held-out and of fitted rows that lie in their predicted 95 % regions.
+
+    Without gross errors; with the factor by which the regions are widened.
+    """
     measurements = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.outliers]
     kept = ~np.isin(measurements.observation, gross)

@@ -43,10 +43,11 @@ DETECTED = 4.5
 def judgement(
     discovery: Discovery, confirmation: Confirmation | None, content: Discovered
 ) -> Judgement:
-    """Judgement of a discovery: 'good' if its verdict is proven and no data disagree.
+    """Return the judgement of a discovery: 'good' if its verdict is proven and no data disagree.
 
     Else 'caution'. Data disagree by errors above the noise, by differences between repeated
-    measurements, or by disagreements of the session. ``content``: the content of discovery.json.
+    measurements, or by disagreements of the session. ``confirmation``: by another session, or
+    None; ``content``: the content of discovery.json.
     """
     more = more_than_noise(content)
     again = MeasuredAgain.of(discovery.fit.session.measurements)
@@ -75,10 +76,11 @@ def judgement(
 
 
 def more_than_noise(content: Discovered) -> str:
-    """Sentence that held-out rows show an error that the model does not have; '' if not.
+    """Return a sentence if held-out rows show an error that the model does not have, else ''.
 
-    Below 92 % of them surely in their regions (`FEWEST_INSIDE`), or an RMS error above 1.25 times
-    the noise (`MOST_OVER_NOISE`), plus 1 / √rows.
+    They do if the upper 95 % limit of the share inside their predicted regions is below 92 %
+    (`FEWEST_INSIDE`), or their RMS error is above 1.25 (`MOST_OVER_NOISE`) plus 1 / √rows
+    times the noise. '' without held-out rows.
     """
     finding = 'something is left that the model does not have.'
     if isinstance(content.session, Struct) and content.session.validation.poses < FEWEST_HELD_OUT:
@@ -104,8 +106,8 @@ def more_than_noise(content: Discovered) -> str:
 def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
     """Whether held-out poses, and the other session if there is one, agree with the verdict.
 
-    False without held-out poses, for causes that are not certain or came at a moment, and if the
-    sampling has not converged.
+    False also without enough held-out poses, for causes that are not certain or happened at a
+    moment, for errors without a cause, and if the sampling has not converged.
     """
     if discovery.verdict in ('undetermined', 'unexplained') or discovery.unexplained:
         return False
@@ -131,17 +133,19 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
 
 
 def least_seen_m(discovery: Discovery) -> float:
-    """Smallest RMS displacement of the marker, m, by a cause that would be found.
+    """Return the smallest RMS displacement of the marker by a cause that would be found, m.
 
-    After everything else is fitted again it amounts to `DETECTED` standard deviations of all rows
-    together.
+    So large that, over all rows together, it amounts to `DETECTED` standard deviations.
     """
     numbers = discovery.residuals.errors.size
     return float(DETECTED * discovery.gain.noise_floor_m / np.sqrt(numbers))
 
 
 def _spoilt(discovery: Discovery) -> bool:
-    """Whether gross errors make the error on held-out poses over 1.5 times larger (`SPOILT`)."""
+    """Whether gross errors make the RMS error on held-out poses over 1.5 times larger (`SPOILT`).
+
+    False without held-out poses.
+    """
     every, kept = discovery.gain.held_out_rms_after_m, discovery.gain.held_out_kept_after_m
     return every is not None and kept is not None and every > SPOILT * kept
 
@@ -158,7 +162,7 @@ def _gross(discovery: Discovery) -> str:
 
 
 def _would_show(discovery: Discovery) -> bool:
-    """Whether a cause of half the noise (`MOST_UNSEEN`) at the marker would have been found."""
+    """Whether a cause that moves the marker by half the noise (`MOST_UNSEEN`) would be found."""
     return least_seen_m(discovery) < MOST_UNSEEN * discovery.gain.noise_floor_m
 
 
@@ -178,9 +182,9 @@ def _uncertain(discovery: Discovery) -> str:
 def headline(
     discovery: Discovery, confirmation: Confirmation | None = None, more: str = ''
 ) -> str:
-    """Result of a discovery in one or a few sentences.
+    """Return the result of a discovery in one or a few sentences.
 
-    ``confirmation``: by another session; ``more``: finding on held-out rows, of `more_than_noise`.
+    ``confirmation``: by another session, or None; ``more``: result of `more_than_noise`.
     """
     result = _result(
         discovery, confirmation, something_left=bool(more) or bool(discovery.outliers)
@@ -191,9 +195,9 @@ def headline(
 def _result(
     discovery: Discovery, confirmation: Confirmation | None, *, something_left: bool
 ) -> str:
-    """Sentences on the verdict and the errors on held-out poses.
+    """Return sentences on the verdict and the errors on held-out poses.
 
-    ``something_left``: whether gross errors or more than noise are left.
+    ``something_left``: whether there are gross errors, or errors above the noise.
     """
     gain = discovery.gain
     change = ''

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 
 def write_discovery_report(discovery: Discovery, content: Discovered, folder: Path) -> Path:
-    """Write report.html and figures of a discovery to a folder, made if missing; return its path.
+    """Write a discovery's report.html with its figures; return the path of report.html.
 
-    Raises DiskError if the folder cannot be written to.
+    ``folder``: made if missing. Raises DiskError if it cannot be written to.
     """
     drawings = draw_discovery(discovery)
     html = discovery_html(content, discovery.fit.session, drawings)
@@ -29,7 +29,10 @@ def write_discovery_report(discovery: Discovery, content: Discovered, folder: Pa
 
 
 def discovery_html(content: Discovered, session: Session, drawings: dict[str, str]) -> str:
-    """Page of a discovery, with the given drawings (of `draw_discovery`)."""
+    """Return the text of a discovery's page.
+
+    ``drawings``: SVG text by name, of `draw_discovery`.
+    """
     return page(
         'discovery.html.jinja',
         found=msgspec.to_builtins(content),

@@ -76,15 +76,18 @@ STYLE: Any = {
 def as_figures(
     figures: Mapping[str, Callable[[Drawn], Figure]], subject: Drawn
 ) -> dict[str, Figure]:
-    """Figures of a subject (fit, discovery or report), drawn in the style of reports, by name."""
+    """Draw figures of a subject (fit, discovery or report) in the style of reports.
+
+    ``figures``: function that draws each, by name. Returns them by the same names.
+    """
     with matplotlib.rc_context(STYLE):
         return {name: draw(subject) for name, draw in figures.items()}
 
 
 def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dict[str, str]:
-    """Figures of a subject (fit, discovery or report) as SVG text, by name.
+    """Draw figures of a subject (fit, discovery or report) as SVG text, by name.
 
-    The same subject gives the same text.
+    ``figures``: function that draws each. The same subject gives the same text.
     """
     texts = {}
     for name, draw in figures.items():
@@ -106,9 +109,10 @@ def evenly(count: int, most: int) -> IntArray:
 
 
 def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = None) -> FloatArray:
-    """Base, joints and tip of arms at n configurations (n, k), in R, m, (n, k + 2, 3).
+    """Return the points of arms drawn as lines: base, joints and tip, (n, k + 2, 3).
 
-    ``q``: rad, m for slides; ``offsets``: zero-offsets to add, (k,), or None.
+    In the robot base R, m. ``q``: n configurations, rad, m for slides, (n, k); ``offsets``:
+    zero-offsets to add, (k,), or None.
     """
     joints = chain.frames(q, offsets)[..., :3, 3]
     tips = chain.forward(q, offsets)[:, None, :3, 3]

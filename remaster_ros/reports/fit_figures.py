@@ -44,12 +44,15 @@ WHOLE_TURN_DEG = 359.999
 
 
 def draw_fit(result: FitResult) -> dict[str, str]:
-    """All figures of a fit as SVG text, by file name without ending."""
+    """Draw all figures of a fit; return them as SVG text by file name without ending."""
     return as_svg(fit_figures(result), result)
 
 
 def fit_figures(_: FitResult) -> dict[str, Callable[[FitResult], Figure]]:
-    """Function that draws each figure of a fit, by file name without ending; the fit is unused."""
+    """Return the functions that draw a fit's figures, by file name without ending.
+
+    The same for every fit: the argument is unused.
+    """
     return {
         'posteriors': posteriors,
         'traces': traces,
@@ -172,7 +175,11 @@ def residual_distribution(result: FitResult) -> Figure:
 
 
 def tool_places_of_one(result: FitResult) -> Figure:
-    """Draw possible positions of the marker at one configuration, in three views (Fig. 5)."""
+    """Draw the possible marker positions at the configuration of median error, in three views.
+
+    Draws of the posterior with and without noise, and the positions with offsets zero and
+    estimated (Fig. 5).
+    """
     m = result.measurements
     lengths = np.linalg.norm(result.residuals_before, axis=1)
     fitted = np.flatnonzero(~m.is_validation)
@@ -207,7 +214,10 @@ def tool_places_of_one(result: FitResult) -> Figure:
 
 
 def accuracy_map(result: FitResult) -> Figure:
-    """Draw the predicted error over the workspace, from the side and from above."""
+    """Draw the predicted error over the workspace, from the side and from above.
+
+    At random configurations, with the measured marker positions as points.
+    """
     m = result.measurements
     found = predicted_accuracy(result.predictive, m, MAP_POINTS, np.random.default_rng(0))
     error_mm = 1e3 * found.error
@@ -261,9 +271,11 @@ def _panels(
     right: float = 0.1,
     down: float = 0.0,
 ) -> tuple[Figure, list[Axes]]:
-    """Figure of panels (rows, columns), with margins and the space below a panel, inches.
+    """Make a figure of panels, with fixed margins; return it and its panels, row by row.
 
-    They are fixed, as finding them takes longer than drawing the figure.
+    ``height_in``: of the figure, inches; ``shape``: rows and columns; ``left`` to ``right``:
+    margins, ``down``: space below a panel, inches. Fixed, as finding them takes longer than
+    drawing the figure.
     """
     rows, columns = shape
     across = left + 0.1
@@ -284,7 +296,7 @@ def _panels(
 def _joint_panels(
     result: FitResult, height_in: float, left: float, top: float
 ) -> tuple[Figure, list[Axes]]:
-    """Figure with a titled panel for each joint, two in a row, and the k panels.
+    """Make a figure with a titled panel for each joint, two in a row; return it and the panels.
 
     ``height_in``: of a row, inches; ``left``, ``top``: margins, inches.
     """
@@ -313,7 +325,7 @@ def _write_instead(ax: Axes, text: str) -> None:
 
 
 def _short(why: str) -> str:
-    """Sentence 'Not identifiable: …' with the reason up to its first ';', before the remedy."""
+    """Return 'Not identifiable: …' with a reason up to its first ';', where the remedy begins."""
     reason = why.split(';')[0]
     return f'Not identifiable: {reason}.'
 

@@ -40,7 +40,7 @@ FIT_LIMIT = 64 * 1024**2
 
 
 def estimates(result: FitResult) -> dict[str, Any]:
-    """Estimates of a fit as fit.json and discovery.json have them, not yet checked.
+    """Return the estimates of a fit as fit.json and discovery.json have them, not yet checked.
 
     Keys: robot, session, joint_offsets, registration, markers, noise, sampler.
     """
@@ -82,9 +82,10 @@ def _offsets(result: FitResult) -> list[dict[str, Any]]:
 
 
 def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]:
-    """A row for each joint of values in rad or m, (k, ...), converted to degrees or mm.
+    """Return a row for each joint of values in rad or m, (k, ...), converted to degrees or mm.
 
-    A column x becomes x_deg, and for a prismatic joint x_mm, with x_deg null.
+    ``columns``: values by name. A column x becomes x_deg; for a prismatic joint x_mm, with
+    x_deg None. Each row has its ``unit``, too.
     """
     rows = []
     for joint, (unit, scale) in enumerate(zip(chain.shown_units, chain.shown_scale)):
@@ -95,7 +96,7 @@ def of_joints(chain: SerialChain, **columns: FloatArray) -> list[dict[str, Any]]
 
 
 def _geometry(result: FitResult, geometry: GeometryModel) -> dict[str, Any]:
-    """Content of the key geometry of fit.json, of link lengths and axis tilts.
+    """Return the content of the key geometry of fit.json, on link lengths and axis tilts.
 
     With the length or tilt that changes each identifiable offset most.
     """
@@ -163,9 +164,10 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
 
 
 def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
-    """Std of each identifiable offset from the positions alone, by name; None if infinite.
+    """Return the std of each identifiable offset from positions alone, by joint, deg or mm.
 
-    Key 'std_positions_deg', and '…_mm' if there are prismatic joints; empty without orientations.
+    Keys 'std_positions_deg', and 'std_positions_mm' if there are prismatic joints; None for an
+    infinite std. Without orientations 'std_positions_deg' is {}.
     """
     found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
     information = None if result.orientations is None else result.orientations.information
@@ -179,9 +181,10 @@ def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
 
 
 def fit_content(result: FitResult) -> schemas.Fit:
-    """Checked content of fit.json, as an object; keys without a value are unset.
+    """Return the content of fit.json, checked against its schema; keys without a value are unset.
 
-    Standard deviations of draws have n - 1 in the denominator; those of offsets are widened.
+    The std of sampled parameters has n - 1 in its denominator; that of offsets includes errors
+    that the model does not have, and lengths and tilts off their drawing.
     """
     draws = result.draws.reshape(-1, result.draws.shape[-1])
     content: dict[str, Any] = {
@@ -228,14 +231,17 @@ def fit_content(result: FitResult) -> schemas.Fit:
 
 
 def clocks_content(clocks: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    """Delays of the sensors' stamps and their stds, s, as files have them, in ms."""
+    """Return the delays of the sensors' stamps as files have them, in ms.
+
+    ``clocks``: delay and its standard deviation by sensor, s.
+    """
     return {
         name: {'late_ms': 1e3 * late, 'std_ms': 1e3 * std} for name, (late, std) in clocks.items()
     }
 
 
 def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
-    """Rows, as dicts by column name, of equally long columns.
+    """Return columns of equal length as rows, dicts by column name.
 
     Raises ValueError if the columns differ in length.
     """
@@ -243,7 +249,7 @@ def table_rows(**columns: Iterable[Any]) -> list[dict[str, Any]]:
 
 
 def _describe(session: Session) -> dict[str, Any]:
-    """Counts by split, sensors and origin of a session, as the key session has them."""
+    """Return the content of the key session: counts by split, sensors, and origin of a session."""
     m = session.measurements
     counts = {
         name: {
@@ -275,10 +281,10 @@ def read_fit(path: str | os.PathLike[str]) -> schemas.Fit:
 
 
 def read_result(path: Path, schema: type[Record], form: str, name: str, verb: str) -> Record:
-    """Read the file ``name`` that the command ``verb`` wrote, as a record of the schema.
+    """Read the file ``name`` that the command ``verb`` wrote, as an object of the schema.
 
-    ``form``: its format. Raises InputError if it is missing, damaged, of another format, or lacks
-    a key.
+    ``form``: its format. Raises InputError if it is missing, damaged, of another format, or
+    lacks a key.
     """
     data = read_limited(path, FIT_LIMIT, f'give the {name} that "remaster {verb}" wrote')
     return decoded(data, path, schema, form, f'give a {name} of format {form}')

@@ -32,7 +32,7 @@ SEARCH = 'run "remaster discover"'
 
 
 class _Comparison(NamedTuple):
-    """Mean errors before and after the fit, which its judgement compares."""
+    """Mean errors before and after a fit, mm, by which it is judged."""
 
     validated: bool  # Whether they are of held-out poses
     again: MeasuredAgain  # Held-out configurations that were fitted as well
@@ -42,7 +42,7 @@ class _Comparison(NamedTuple):
 
     @property
     def gain(self) -> float:
-        """Error before over error after."""
+        """Ratio of the mean error before to that after."""
         return self.before_mm / max(self.after_mm, 1e-9)
 
     @property
@@ -52,7 +52,7 @@ class _Comparison(NamedTuple):
 
 
 class _Residuals(NamedTuple):
-    """Result of the comparison of the residuals with noise, a sentence for each point."""
+    """Comparison of a fit's residuals with the noise of each sensor: sentences and conclusions."""
 
     unexplained: list[NoiseCheck]  # Checks of the sensors whose error noise does not explain
     findings: list[str]  # These errors, and the drivers that the residuals follow
@@ -62,10 +62,11 @@ class _Residuals(NamedTuple):
 
 
 def verdict(result: FitResult) -> Judgement:
-    """Judgement of a fit: gain, convergence, and offsets that are not identifiable.
+    """Return the judgement of a fit by its gain, convergence, residuals and data.
 
-    'bad' if chains disagree, the error grows by over a tenth or offsets are implausible; 'good' if
-    held-out poses show a gain of a tenth, noise explains the rest and nothing disagrees.
+    'bad' if chains disagree, the error grows by over a tenth or offsets are implausible;
+    'good' if held-out poses show a gain of a tenth, noise explains the rest and nothing
+    disagrees; else 'caution'.
     """
     compared = _comparison(result)
     residuals = _residuals(result)
@@ -92,7 +93,10 @@ def verdict(result: FitResult) -> Judgement:
 
 
 def _comparison(result: FitResult) -> _Comparison:
-    """Errors before and after, on held-out poses if there are any, else on fitted ones."""
+    """Return the mean errors before and after, on held-out poses if any, else on fitted ones.
+
+    Held-out gross errors do not count.
+    """
     validated = result.accuracy['validation'] is not None
     before, after = _mean_errors_mm(result, validated)
     again = MeasuredAgain.of(result.session.measurements)
@@ -151,9 +155,10 @@ def _not_proven(result: FitResult, compared: _Comparison) -> list[str]:
 def _mood_and_headline(
     result: FitResult, compared: _Comparison, residuals: _Residuals, proven: bool
 ) -> tuple[Mood, str]:
-    """Mood and headline by convergence and gain, before implausible offsets are considered.
+    """Return mood and headline by convergence and gain.
 
-    ``proven``: whether enough held-out poses show the gain, and no data disagree.
+    Before implausible offsets are considered. ``proven``: whether enough poses were held out
+    and no data disagree.
     """
     sampler, change = result.sampler, compared.change
     rest = f' {_dominated(result, residuals.unexplained)}' if residuals.doubtful else ''
@@ -184,7 +189,11 @@ def _mood_and_headline(
 
 
 def _measurement_remarks(result: FitResult, again: MeasuredAgain) -> list[str]:
-    """Remarks on motion, on held-out configurations fitted as well, and on a correction."""
+    """Return remarks on the measurement, [] if there are none.
+
+    On motion against standstill, on held-out configurations that were fitted as well, and on a
+    correction in use.
+    """
     proof = result.motion_proof
     remarks = [
         proof.words if proof is not None and not proof.disagree else '',
@@ -228,9 +237,9 @@ def _left_out(result: FitResult) -> list[str]:
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
-    """Number of rounds of the references, and sentences on changes during the session.
+    """Return the number of rounds of the references, and sentences on changes between them.
 
-    (0, []) without references.
+    (0, []) for a session without references.
     """
     if result.session.references is None:
         return 0, []
@@ -242,9 +251,9 @@ def references(result: FitResult) -> tuple[int, list[str]]:
 
 
 def _sampling(sampler: SamplerInfo) -> str:
-    """Sentence on the convergence of the sampling, with the next step if it has not converged.
+    """Return a sentence on whether the sampling has converged, with a next step if not.
 
-    Its figures, such as R-hat, are in the appendix of a report.
+    Numbers such as R-hat are in the appendix of a report.
     """
     percent_of_std = 100 * (sampler.precision or np.nan)
     exact = f'every mean is exact to {percent_of_std:.1f} % of its standard deviation'
@@ -285,7 +294,10 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
 
 
 def _structure(result: FitResult) -> list[str]:
-    """Sentences on the drivers that the residuals follow, each with its probability by chance."""
+    """Return sentences on what the residuals depend on, each with its probability by chance.
+
+    [] if they depend on nothing found, or were not tested.
+    """
     found = result.structure.found if result.structure is not None else ()
     tests = [(test.words(result.session.timed), test.chance) for test in found]
     return [f'{words[0].upper()}{words[1:]} ({chance}).' for words, chance in tests]
@@ -313,7 +325,7 @@ def without_search(headline: str) -> str:
 
 
 def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
-    """Sentence why the error after is no success, and the next step.
+    """Return a sentence on why noise does not explain the errors after a fit, with a next step.
 
     ``unexplained``: checks of the sensors whose error noise does not explain.
     """
@@ -332,9 +344,9 @@ def _dominated(result: FitResult, unexplained: Sequence[NoiseCheck]) -> str:
 
 
 def _compared(check: NoiseCheck) -> str:
-    """Error and noise of a sensor as a sentence, for an error that noise does not explain.
+    """Return a sentence on a sensor's error after the fit, and noise that does not explain it.
 
-    Or for one of which the noise is unknown, with what to measure.
+    If the noise is unknown, on what to measure for it.
     """
     if check.is_of_no_instrument:
         return check.no_instrument

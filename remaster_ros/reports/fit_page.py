@@ -41,7 +41,7 @@ FAR = 1.0
 
 
 class View3D(NamedTuple):
-    """Data that fit_page.js shows, and figures of its caption."""
+    """Data of a fit's 3-D view for fit_page.js, and the numbers of its caption."""
 
     # All in the robot base R, m: `scene` (`scene_to_dict`), `arms` (a, k + 2, 3), `points` (n, 3)
     # with `text`, ends of their error vectors (`before` and `after`, (n, 3)), `sensors` with
@@ -56,17 +56,17 @@ class View3D(NamedTuple):
 
     @property
     def data(self) -> str:
-        """The picture as JSON, compressed and in base64 for the page."""
+        """`picture` as JSON, gzip-compressed and in base64 for the page."""
         return compressed(json.dumps(self.picture, separators=(',', ':'), allow_nan=False))
 
     @property
     def code(self) -> str:
-        """The scripts of the 3-D view, compressed and in base64 for the page."""
+        """Scripts of the 3-D view, gzip-compressed and in base64 for the page."""
         return compressed(view_script('fit_page.js'))
 
 
 def draw_view(result: FitResult) -> View3D:
-    """3-D view of a fit: arms, sensors, markers, and magnified errors before and after.
+    """Make the 3-D view of a fit: arms, sensors, markers, and magnified errors before and after.
 
     At most `ROWS_SHOWN` rows and `ARMS_SHOWN` arms, evenly spread, are drawn.
     """
@@ -122,12 +122,15 @@ def draw_view(result: FitResult) -> View3D:
 
 
 def _rounded(points: FloatArray) -> Any:
-    """Points as lists, to a hundredth of a millimetre."""
+    """Return points, m, as nested lists, rounded to a hundredth of a millimetre."""
     return np.round(points, 5).tolist()
 
 
 def _point_texts(result: FitResult, shown: IntArray) -> list[str]:
-    """Description of each shown row (indices): numbers, sensor, errors before and after, mm."""
+    """Return a text for each shown row: its numbers, sensor, and errors before and after, mm.
+
+    ``shown``: indices of the rows.
+    """
     m = result.session.measurements
     before, after = (
         lengths_mm(residuals[shown])
@@ -150,7 +153,7 @@ def _round_factor(factor: float) -> int:
 
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
-    """A row for each split and metric, with the reason if there is no number.
+    """Return a table row for each split and metric, with the reason if there is no number.
 
     Validation first, if held out; metrics at random configurations once, with split 'any'.
     """
@@ -196,10 +199,11 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
 
 
 def motion_rows(fit: Fit) -> list[tuple[str, str]]:
-    """What a fit of motion says besides the offsets: quantity and value, as text; [] without.
+    """Return what a fit of a moving session states besides offsets: (quantity, value) as texts.
 
-    How late the stamps of each sensor are, lag and wind-up of each joint, the frequency at which
-    the tool swings, and the held-out errors in motion and at standstill.
+    How late the stamps of each sensor are, lag and wind-up of each joint, the frequency at
+    which the tool swings, and the held-out errors in motion and at standstill. [] for a
+    session without motion.
     """
     if not isinstance(fit.clocks, dict) or not isinstance(fit.parameters, list):
         return []
@@ -237,22 +241,26 @@ def motion_rows(fit: Fit) -> list[tuple[str, str]]:
 
 
 def write_fit_report(result: FitResult, folder: Path) -> Path:
-    """Write report.html and the figures of a fit to a folder, made if missing.
+    """Write report.html and the figures of a fit to a folder; return the path of report.html.
 
-    Returns its path.
+    ``folder``: made if missing. Raises DiskError if it cannot be written to.
     """
     drawings = draw_fit(result) | draw_stages(answer_of(inputs_of(result)))
     return write_report(folder, drawings, fit_html(result, drawings))
 
 
 def inputs_of(result: FitResult) -> Inputs:
-    """`Inputs` of the first screen for a fit alone; what needs a discovery is None."""
+    """Return a fit as the `Inputs` of a report; what needs a discovery is None."""
     before_mm, after_mm = map(lengths_mm, (result.residuals_before, result.residuals_after))
     return Inputs(result.session, fit_content(result), None, before_mm, after_mm, None)
 
 
 def fit_html(result: FitResult, drawings: dict[str, str]) -> str:
-    """Page of a fit; with drawings (of `draw_fit`) also the 3-D view, without ({}) none."""
+    """Return the text of a fit's page.
+
+    ``drawings``: SVG text by name, of `draw_fit` and `draw_stages`; if {}, the page has no
+    figures and no 3-D view.
+    """
     scene: View3D | None = None
     if drawings:
         scene = draw_view(result)

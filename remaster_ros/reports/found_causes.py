@@ -19,7 +19,7 @@ def read_causes(
     joint_names: Sequence[str] = (),
     observations_sha256: str = '',
 ) -> tuple[FoundCause, ...]:
-    """Causes of a discovery.json that have look-alikes.
+    """Return the causes of a discovery.json that have look-alikes which poses can separate.
 
     Parameters
     ----------
@@ -109,8 +109,9 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovere
 
 
 def _separable(effect: FoundEffect) -> list[LookAlike]:
-    """Look-alikes of an effect that further poses can separate from it.
+    """Return the look-alikes of an effect that further poses can separate from it.
 
-    Not those that are another name or a general form of it.
+    Not those that displace every pose alike (`same`), or of whose shapes the effect is one
+    (`general`).
     """
     return [other for other in effect.confusable_with if not other.same and not other.general]

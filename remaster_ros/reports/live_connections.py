@@ -49,7 +49,7 @@ LONGEST_LINE = 400
 
 @dataclass(frozen=True)
 class Place:
-    """Address and port at which the page is served."""
+    """Address, port and certificate with which the live page is served."""
 
     # IP address to listen on, and port; 0 for any free port
     address: str = '127.0.0.1'
@@ -62,7 +62,7 @@ class Place:
 
 
 def listen(place: Place) -> socket.socket:
-    """Non-blocking socket that listens at a place.
+    """Open a non-blocking socket that listens at an address and port.
 
     Raises InputError if the address is no IP address, is not a loopback address without a
     certificate, or cannot be used.
@@ -104,7 +104,7 @@ def tls(place: Place) -> ssl.SSLContext | None:
 
 
 def hosts(place: Place, port: int) -> tuple[str, ...]:
-    """Allowed values of the header Host, 'name:port'; the first is in the page's address.
+    """Return the allowed values of the HTTP header Host, 'name:port'; the URL has the first.
 
     ``port``: that of the socket.
     """
@@ -120,9 +120,10 @@ def hosts(place: Place, port: int) -> tuple[str, ...]:
 
 @dataclass
 class _OpenConnection:
-    """An open connection: its address, since when it owes a request.
+    """Open connection to a browser.
 
-    Last result: whether it has the token.
+    ``address``: of the user, see `_network`; ``since_s``: monotonic time of its begin or last
+    answer; ``has_token``: whether it has shown the token.
     """
 
     address: str
@@ -131,7 +132,10 @@ class _OpenConnection:
 
 
 class BoundedServer(HTTPServer):
-    """Web server with a bounded number of connections; parameters as of `HTTPServer`."""
+    """HTTP server with a bounded number of connections.
+
+    Parameters as of tornado's `HTTPServer`.
+    """
 
     def initialize(self, *args: Any, **kwargs: Any) -> None:
         """Set up as in tornado, and begin to close late connections."""
@@ -155,7 +159,7 @@ class BoundedServer(HTTPServer):
             super().handle_stream(stream, address)
 
     def on_close(self, server_conn: object) -> None:
-        """Forget a connection that has ended."""
+        """Forget a connection that has ended; called by tornado."""
         assert isinstance(server_conn, HTTP1ServerConnection)
         super().on_close(server_conn)
         self._open.pop(server_conn.stream, None)
@@ -171,9 +175,9 @@ class BoundedServer(HTTPServer):
             connection.since_s = time.monotonic()
 
     def _close_oldest(self, address: str) -> None:
-        """Close the oldest connection of an address, those without the token first.
+        """Close the oldest connection of an address, one without the token if there is any.
 
-        The address has to have one. Age is the time since its last answer or its begin.
+        ValueError if the address has none. Age is the time since its last answer or its begin.
         """
         of_it = [
             (connection.has_token, connection.since_s, id(stream))
@@ -210,9 +214,9 @@ def _stream(request: HTTPServerRequest) -> IOStream:
 
 
 def _network(address: str) -> str:
-    """Key of one user's addresses: an IPv4 address, or the /64 network of an IPv6 one.
+    """Return the key by which connections of one user are counted.
 
-    Text that is no address is unchanged.
+    An IPv4 address, or the /64 network of an IPv6 one; text that is no address is unchanged.
     """
     with contextlib.suppress(ValueError):
         if isinstance(
@@ -223,7 +227,10 @@ def _network(address: str) -> str:
 
 
 class _RareHandler(logging.Handler):
-    """Handler that writes a line a minute to stderr, and counts the others; it never blocks."""
+    """Log handler that writes at most a line a minute to stderr, and counts the others.
+
+    It never blocks.
+    """
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -253,7 +260,10 @@ class _RareHandler(logging.Handler):
 
 
 def log_rarely(loop: asyncio.AbstractEventLoop) -> None:
-    """Report errors of tornado and of an event loop in one line a minute on stderr."""
+    """Log errors of tornado and of an event loop to stderr, at most one line a minute.
+
+    Replaces the handlers of the logger 'tornado' and the loop's exception handler.
+    """
     handler = _RareHandler()
     logger = logging.getLogger('tornado')
     logger.handlers, logger.propagate = [handler], False

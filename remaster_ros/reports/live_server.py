@@ -85,19 +85,20 @@ _HEADERS = {
 
 
 class SeenView(msgspec.Struct, forbid_unknown_fields=True):
-    """View that a person has seen who lets the arm move or confirms: its number and mark."""
+    """Number and mark of the view that a person saw before `collect` or `confirm`."""
 
     view: int
     seen: str
 
 
 class LiveServer:
-    """Server of the page, in a thread of its own.
+    """Web server of the live page, in a thread of its own; it starts when made.
 
-    ``token`` is required for view and commands, ``scene`` is the fixed part of the 3-D view, JSON.
-    ``send`` is called in the server's thread with the name of a command (``confirm/NAME`` for the
-    plan of that name) and with a callback for its outcome, which any thread may call: success, and
-    a line for the person. Raises InputError if address or certificate cannot be used.
+    ``place``: where it listens; ``token``: required for view and commands; ``scene``: fixed
+    part of the 3-D view, JSON. ``send`` is called in the server's thread with the name of a
+    command (``confirm/NAME`` for the plan of that name) and with a callback for its outcome,
+    which any thread may call: success, and a line for the person. Raises InputError if address
+    or certificate cannot be used.
     """
 
     def __init__(self, place: Place, token: str, scene: bytes, send: Send) -> None:
@@ -127,17 +128,20 @@ class LiveServer:
         return time.monotonic() - self._asked_s < WATCHED_S
 
     def publish(self, view: dict[str, Any]) -> None:
-        """Show a view from now on; any thread may call this.
+        """Show a view on the page from now on; any thread may call this.
 
-        Its ``seen`` is the mark that `collect` and `confirm` have to name; its ``confirmation``
-        has the plan that they confirm, or is None.
+        ``view``: of `LiveView.view`. Its 'seen' is the mark that the commands 'collect' and
+        'confirm' have to name; its 'confirmation' has the plan to be confirmed, or is None.
         """
         content = msgspec.json.encode(view)  # NaN becomes null, which browsers read.
         plan = view['confirmation']['plan'] if view['confirmation'] else ''
         self._loop.call_soon_threadsafe(self._show, content, str(view['seen']), plan)
 
     def _show(self, content: bytes, seen: str, plan: str) -> None:
-        """Replace view and plan, note number and time of the view; runs in the server's thread."""
+        """Replace view and plan, and give the view a number and the time; in the server's thread.
+
+        ``content``: the view as JSON; ``seen``: its mark; ``plan``: name of its plan, or ''.
+        """
         self._issued.append((self._issued[-1][0] + 1, time.monotonic()))
         self._view, self._seen, self._plan = content, seen, plan
 
@@ -151,11 +155,11 @@ class LiveServer:
         return f'plan/{name}'
 
     def _take_plan(self, name: str, content: bytes) -> None:
-        """Replace the page of the plan; runs in the server's thread."""
+        """Replace name and compressed page of the plan; runs in the server's thread."""
         self._plan_page = name, content
 
     def plan_page(self, name: str) -> bytes:
-        """Page of the plan of this name, compressed; empty for another name."""
+        """Return the gzip-compressed page of the plan of this name; b'' for any other name."""
         current_name, content = self._plan_page
         return (
             content
@@ -164,17 +168,17 @@ class LiveServer:
         )
 
     def view(self) -> bytes:
-        """The view as JSON with its number and age, s; notes that somebody watches."""
+        """Return the current view as JSON, with number and age, s; note that somebody watches."""
         self._asked_s = time.monotonic()
         number, issued_s = self._issued[-1]
         age_s = min(self._asked_s - issued_s, 1e6)
         return b'{"number":%d,"age_s":%.2f,"view":%s}' % (number, age_s, self._view)
 
     def refusal(self, seen: SeenView) -> str:
-        """Reason why a person who has seen this view must look again; '' if it is current.
+        """Return the reason to refuse a command given on an outdated view; '' if it is current.
 
-        Refused are views over 3 s old (`FRESH_S`), used before, or of another state. One that is
-        accepted counts as used.
+        Refused are views over 3 s old (`FRESH_S`), used before, or of another state. One that
+        is accepted counts as used.
         """
         issued = dict(self._issued).get(seen.view, float('-inf'))
         if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
@@ -186,17 +190,21 @@ class LiveServer:
         return ''
 
     def command(self, name: str) -> str:
-        """Command passed to `send`; '' if the view has no plan to confirm."""
+        """Return the command to pass to `send` for one of the page.
+
+        'confirm' becomes 'confirm/NAME' with the plan's name, '' if the view has no plan;
+        others are unchanged.
+        """
         if name != CONFIRM:
             return name
         return f'{CONFIRM}/{self._plan}' if self._plan else ''
 
     def trust(self, request: HTTPServerRequest) -> None:
-        """Keep the connection of a request that has shown the token."""
+        """Count the connection of a request as one that has shown the token."""
         self._connections.trust(request)
 
     def note_answer(self, request: HTTPServerRequest) -> None:
-        """Begin the time for the next request of a connection."""
+        """Note that a request is answered: the time for its connection's next one begins."""
         self._connections.note_answer(request)
 
     def close(self) -> None:
@@ -239,7 +247,7 @@ class LiveServer:
 
 
 class _Handler(RequestHandler):
-    """Request handler that refuses requests of other pages."""
+    """HTTP request handler that refuses requests by other host names or from other web pages."""
 
     SUPPORTED_METHODS = ('GET', 'HEAD', 'POST')  # type: ignore[assignment]
 
@@ -248,7 +256,7 @@ class _Handler(RequestHandler):
         self._server = server
 
     def on_finish(self) -> None:
-        """Begin the time for the connection's next request."""
+        """Note that the request is answered; called by tornado."""
         self._server.note_answer(self.request)
 
     def set_default_headers(self) -> None:
@@ -273,7 +281,7 @@ class _Handler(RequestHandler):
             raise HTTPError(403, reason='the request comes from another page')
 
     def write_error(self, status_code: int, **_: Any) -> None:
-        """Answer an error as JSON: done false, and the reason as message."""
+        """Answer an error as JSON: 'done' is false, 'message' the reason."""
         self.set_header('Content-Type', 'application/json')
         self.finish(json.dumps({'done': False, 'message': self._reason}))
 
@@ -285,13 +293,15 @@ class _Handler(RequestHandler):
 
 
 class _File(_Handler):
+    """Handler of the page's fixed files, which need no token."""
+
     def get(self) -> None:
         """Answer with the fixed file of the requested name."""
         self._packed(*self._server.files[self.request.path.removeprefix('/')])
 
 
 class _Plan(_Handler):
-    """Page of a plan, at an address that only the view contains."""
+    """Handler of the page of a plan, at a random address that only the view contains."""
 
     def get(self, name: str) -> None:
         """Answer with the page of a plan, sandboxed; HTTPError 404 if it is out of date."""
@@ -305,6 +315,8 @@ class _Plan(_Handler):
 
 
 class _Nothing(_Handler):
+    """Handler of all addresses that are not served."""
+
     def prepare(self) -> None:
         """Refuse any address that is not served, HTTPError 404."""
         super().prepare()
@@ -312,6 +324,8 @@ class _Nothing(_Handler):
 
 
 class _WithToken(_Handler):
+    """Handler of requests that need the token."""
+
     def prepare(self) -> None:
         """Refuse a request without the token, HTTPError 401; trust its connection otherwise."""
         super().prepare()
@@ -323,6 +337,8 @@ class _WithToken(_Handler):
 
 
 class _View(_WithToken):
+    """Handler that answers with the current view."""
+
     def get(self) -> None:
         """Answer with the current view as JSON."""
         self.set_header('Content-Type', 'application/json')
@@ -330,12 +346,16 @@ class _View(_WithToken):
 
 
 class _Scene(_WithToken):
+    """Handler that answers with the fixed part of the 3-D view."""
+
     def get(self) -> None:
         """Answer with the fixed part of the 3-D view as JSON."""
         self._packed(self._server.scene, 'application/json')
 
 
 class _Command(_WithToken):
+    """Handler of the five commands of the page."""
+
     async def post(self, name: str) -> None:
         """Send a command to its node and answer with its outcome; a long fit counts as 'fitting'.
 
@@ -378,7 +398,10 @@ def _set(future: asyncio.Future[tuple[bool, str]], outcome: tuple[bool, str]) ->
 
 @cache
 def _files() -> dict[str, tuple[bytes, str]]:
-    """Gzip-compressed files of the page by name ('' is the page itself), with their types."""
+    """Return the page's fixed files by name: gzip-compressed content, and Content-Type.
+
+    '' is the page itself. Cached.
+    """
     folder = importlib.resources.files(__package__).joinpath('live_page')
     plotly = importlib.resources.files('plotly').joinpath('package_data', 'plotly.min.js')
     script = 'text/javascript; charset=utf-8'

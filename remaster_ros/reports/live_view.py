@@ -50,7 +50,7 @@ NODES = (PLANNER, BRIDGE, RECORDER, OPTIMIZER)
 
 @dataclass(frozen=True)
 class PlanPage:
-    """Address at which the page of a plan is served."""
+    """Address at which the page of a plan is served, or why it is not."""
 
     plan: str = ''  # Fingerprint of the plan
     address: str = ''  # Relative to the live page; '' if it is not served
@@ -59,7 +59,7 @@ class PlanPage:
 
 @dataclass(frozen=True)
 class FitFacts:
-    """Facts of a fit other than its offsets."""
+    """Facts of a fit other than its offsets: texts to show, unidentifiable joints, markers."""
 
     shown: Mapping[str, str] = field(default_factory=dict)  # Label -> text
     unidentifiable: frozenset[str] = frozenset()  # Joints whose offset is not identifiable
@@ -69,13 +69,15 @@ class FitFacts:
 
 @dataclass
 class _Node:
+    """Last status of a node: level, message, and time of reception, s; -inf before the first."""
+
     level: str = ''
     message: str = ''
     heard_s: float = float('-inf')
 
 
 class LiveView:
-    """State of a collection as received from its nodes.
+    """State of a collection as received from the ROS nodes, and the view of it for the live page.
 
     ``markers``: sensor -> its markers -> their positions in the tool frame, m, (3,).
     """
@@ -112,10 +114,10 @@ class LiveView:
     def take_summary(
         self, node: str, level: str, message: str, values: Mapping[str, str], now_s: float
     ) -> None:
-        """Take a status of a node from /remaster/status; beyond 30 nodes unknown ones are ignored.
+        """Take a status of a node from /remaster/status; new nodes beyond 30 are ignored.
 
-        ``level``: such as 'ok'; ``values``: counts and plan of the planner; ``now_s``: time of
-        reception.
+        ``level``: such as 'ok'; ``values``: counts and plan, kept of the planner only;
+        ``now_s``: time of reception.
         """
         if node not in self._nodes and len(self._nodes) >= MOST_NODES:
             return
@@ -128,7 +130,7 @@ class LiveView:
             self._pace.update(self._count('configurations_done'), now_s, running=running)
 
     def take(self, body: events.State | events.Event, now_s: float) -> None:
-        """Take a record of /remaster/events: keep a state, make a message of an event.
+        """Take a record of /remaster/events: keep a state, process or report an event.
 
         ``now_s``: present time, s. Reports of unknown sensors are ignored.
         """
@@ -152,9 +154,10 @@ class LiveView:
                 self._add_message(body, now_s)
 
     def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
-        """Note the end of a configuration: its residuals count if it was recorded.
+        """Process the end of a configuration: keep its residuals if it was recorded, even in part.
 
-        Any result but 'recorded' gives a message.
+        They are dropped if it was not seen to settle. Any result but 'recorded' gives a
+        message.
         """
         recorded = end.result in ('recorded', 'partial')
         q = self._open.pop((end.stamp, end.solution), None)
@@ -195,22 +198,26 @@ class LiveView:
             self._target = T_R_T
 
     def take_way(self, way: FloatArray) -> None:
-        """Take the next configurations of the arm, rad or m, (n, k), of which 200 are drawn.
+        """Take the arm's next configurations, rad or m, (n, k), for its path in the 3-D view.
 
-        Ignored if one is not finite.
+        Ignored if a value is not finite; only the first `LONGEST_WAY` are drawn.
         """
         if np.all(np.isfinite(way)):
             self._way = tool_path(self._chain, way[:LONGEST_WAY])
 
     def take_registration(self, sensor: str, T_R_N: FloatArray) -> None:
-        """Take the registration of a sensor, T_R_N, (4, 4); ignored if unknown or not finite."""
+        """Take the registration of a sensor, T_R_N, (4, 4).
+
+        Ignored if the sensor is unknown or a value is not finite.
+        """
         if sensor in self._sensors and np.all(np.isfinite(T_R_N)):
             self.registration[sensor] = T_R_N
 
     def take_offsets(self, means: Mapping[str, float], stds: Mapping[str, float]) -> None:
-        """Take zero-offsets of a fit and their standard deviations, joint -> rad or m.
+        """Take a fit's zero-offsets and their standard deviations, joint -> rad or m.
 
-        Ignored unless all joints have finite ones; residuals are corrected by them from then on.
+        Ignored unless all joints have finite ones. Live residuals are computed with them from
+        then on.
         """
         names = self._chain.joint_names
         values = [by_name.get(name, np.nan) for by_name in (means, stds) for name in names]
@@ -219,7 +226,10 @@ class LiveView:
             self.residuals.use_offsets(np.array([means[name] for name in names]))
 
     def take_fit(self, fit: FitFacts) -> None:
-        """Take further facts of the fit whose offsets were taken, and use its markers."""
+        """Take further facts of the fit whose offsets were taken.
+
+        Its markers are used for the live residuals from then on.
+        """
         self._fit = fit
         self.residuals.use_markers(fit.markers)
 
@@ -233,12 +243,12 @@ class LiveView:
     # What goes out
 
     def plan_to_show(self) -> tuple[str, str]:
-        """Name and page of the next plan; two empty texts if none is shown."""
+        """Return the shown plan's fingerprint and the file of its page; ('', '') if none."""
         plan, page = self._values.get('plan_shown', ''), self._values.get('plan_page', '')
         return (plan, page) if page and _PLAN_NAME.fullmatch(plan) else ('', '')
 
     def view(self, now_s: float) -> dict[str, Any]:
-        """Content of the page at a time, s, of plain types.
+        """Return the content of the page at a time, s, in plain types for JSON.
 
         Messages come newest first, with their age in s.
         """
@@ -260,10 +270,10 @@ class LiveView:
         }
 
     def seen(self, now_s: float) -> str:
-        """Mark of the state that a person must have seen who lets the arm move.
+        """Return a mark of the state that a person must have seen before letting the arm move.
 
-        It changes with the state of the run, a halt, a change of the set-up, the next plan, its
-        confirmation, and whether the planner is heard.
+        A hash, which changes with the state of the run, a halt, a change of the set-up, the
+        next plan, its confirmation, and whether the planner is heard.
         """
         silent = self._silent(PLANNER, now_s)
         state = self._planner.state if self._planner else ''
@@ -274,7 +284,7 @@ class LiveView:
         return hashlib.sha256(what.encode()).hexdigest()[:16]
 
     def _silent(self, node: str, now_s: float) -> bool:
-        """Whether a node was not heard for 3 s (`SILENT_S`)."""
+        """Whether a node was not heard for more than 3 s (`SILENT_S`), or never."""
         return now_s - self._nodes[node].heard_s > SILENT_S
 
     def _count(self, name: str) -> int:
@@ -285,7 +295,11 @@ class LiveView:
             return 0
 
     def _run(self, now_s: float) -> dict[str, Any]:
-        """State and progress of the collection; the state is 'silent' if the planner is."""
+        """Return state and progress of the collection for the page.
+
+        The state is 'silent' if the planner is; counts of configurations are 0 outside the
+        phase 'collection'.
+        """
         done, of = self._count('configurations_done'), self._count('configurations')
         phase = self._values.get('phase', '')
         collecting = phase == 'collection' and of > 0
@@ -310,7 +324,7 @@ class LiveView:
         }
 
     def _node_rows(self, now_s: float) -> list[dict[str, Any]]:
-        """State of each node; one that is silent has level 'error'."""
+        """Return a row for each node: name, level, message; a silent one has level 'error'."""
         rows = []
         for name, node in self._nodes.items():
             age_s = now_s - node.heard_s
@@ -323,7 +337,10 @@ class LiveView:
         return rows
 
     def _sensor_row(self, name: str) -> dict[str, Any]:
-        """State of a sensor, and its last 400 residuals (`MOST_POINTS`), mm."""
+        """Return the state of a sensor for the page.
+
+        With its last 400 residuals (`MOST_POINTS`) and the median of all, mm.
+        """
         report = self._reports.get(name)
         ages = self._recorder.read_age_s if self._recorder else {}
         norms = 1e3 * self.residuals.norms_m(name)
@@ -342,7 +359,10 @@ class LiveView:
         }
 
     def _precision_table(self) -> dict[str, Any]:
-        """Standard deviations of the offsets, degrees, at the last 400 looks, with their times."""
+        """Return the offsets' standard deviations, degrees, at the last 400 looks (`MOST_POINTS`).
+
+        With the number of configurations and the time, minutes, at each; None if unknown.
+        """
         looks = self._precision.looks[-MOST_POINTS:]
         return {
             'message': _clip(self._precision.message),
@@ -355,9 +375,9 @@ class LiveView:
         }
 
     def _result(self) -> dict[str, Any]:
-        """Offsets and facts of the last fit; no joints before there is one.
+        """Return offsets and facts of the last fit for the page.
 
-        Keys: 'joints', a row for each, and 'fit'.
+        Keys: 'joints', a row for each joint, [] before the first fit, and 'fit'.
         """
         return {
             'joints': [
@@ -369,10 +389,10 @@ class LiveView:
         }
 
     def _offset_row(self, joint: int, name: str, mean: float, std: float) -> dict[str, Any]:
-        """Offset of a joint and its std, deg or mm; the std is None while it is undetermined.
+        """Return a joint's offset and its std, deg or mm; the std is None if it is undetermined.
 
-        ``joint``: index from 0; undetermined: not identifiable, or a std of 5 degrees
-        (`UNDETERMINED_RAD`, times ``per_radian``) or more.
+        ``joint``: index from 0; ``mean``, ``std``: rad or m. Undetermined: not identifiable,
+        or a std of 5 degrees (`UNDETERMINED_RAD`, times ``per_radian``) or more.
         """
         as_angle = std / float(self._chain.per_radian[joint])
         known = name not in self._fit.unidentifiable and as_angle < UNDETERMINED_RAD
@@ -386,7 +406,7 @@ class LiveView:
         }
 
     def _confirmation(self) -> dict[str, Any] | None:
-        """Next plan and the address of its page; None if none is shown."""
+        """Return the plan that the planner shows, and its page's address; None without one."""
         plan, page = self.plan_to_show()
         if not plan:
             return None
@@ -401,9 +421,11 @@ class LiveView:
         }
 
     def _commands(self, now_s: float) -> dict[str, dict[str, Any]]:
-        """Label of each command, whether it is enabled now, and a note why not or what it does.
+        """Return label, 'on' (whether enabled now) and note of each command, by its name.
 
-        Commands: 'collect', 'pause', 'stop' (always enabled), 'fit', 'confirm'.
+        Commands: 'collect', 'pause', 'stop' (always enabled), 'fit', 'confirm'. The note of
+        'collect' says why it is disabled, else that the arm moves; of 'stop' and 'confirm'
+        always what they do; '' of 'pause' and 'fit'.
         """
         state = self._planner.state if self._planner else ''
         silent, confirmation = self._silent(PLANNER, now_s), self._confirmation()
@@ -437,7 +459,11 @@ class LiveView:
         }
 
     def _scene(self) -> dict[str, Any]:
-        """Moving part of the 3-D view: joints, target, path, sensors and measured points, in R."""
+        """Return the moving part of the 3-D view: joints, target, path, sensors and points.
+
+        The points are measured ones. In the robot base frame R, m; 'q' and 'target' are None
+        before they were received.
+        """
         q, target = self._q, self._target
         return {
             'q': None if q is None else _rounded(q, 6),

@@ -54,9 +54,10 @@ _ALONE = 'only zero-offsets are corrected here'
 
 @lru_cache(maxsize=2)
 def geometry_of(result: FitResult) -> GeometryModel | None:
-    """Lengths and tilts estimated from a fit's session, with the errors of its files.
+    """Return the lengths and tilts estimated from a fit's session; None without an estimate.
 
-    None without an estimate. The errors are those with the offsets alone and with the robot model.
+    Its errors are computed with the texts of the files to load: URDF with offsets alone, and
+    robot model.
     """
     if result.found is None:
         return None
@@ -79,7 +80,7 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(result: FitResult) -> Uncertainty:
-    """Uncertainty of a fit's offsets as it is shown, for an arm that is not exactly its drawing.
+    """Return a fit's uncertainty of its offsets, for an arm that is not exactly its drawing.
 
     Lengths and tilts within the tolerance of the drawing may change an offset without any
     residual. Without an estimate of them, and for offsets that are not identifiable, it is the
@@ -96,9 +97,9 @@ def uncertainty(result: FitResult) -> Uncertainty:
 
 
 def model_text(result: FitResult, geometry: GeometryModel) -> str:
-    """Text of a URDF with lengths, tilts and offsets fitted together, with a remark on its errors.
+    """Return the text of a URDF with lengths, tilts and offsets fitted together.
 
-    Offsets that are not identifiable are 0.
+    With a remark on its use and errors. Offsets that are not identifiable are 0.
     """
     remark = (
         f'Load this model in place of {URDF_FILE}, never beside another correction: lengths, '
@@ -120,10 +121,11 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 
 
 def compensation_text(result: FitResult, result_sha256: str) -> str:
-    """Text of compensation.json of a fit, with lengths and tilts if a commanded arm gains by them.
+    """Return the text of compensation.json of a fit.
 
-    Near singularities no command reaches the poses that they require; a robot model with them
-    needs none. ``result_sha256``: of fit.json.
+    With lengths and tilts only if commands corrected for them make held-out errors clearly
+    smaller: near singularities no command reaches the poses that they require.
+    ``result_sha256``: of fit.json.
     """
     geometry, rows = geometry_of(result), result.measurements
     described = None if geometry is None else arm_of_geometry(result, geometry, rows)
@@ -137,15 +139,15 @@ def compensation_text(result: FitResult, result_sha256: str) -> str:
 
 
 def _of_fit(described: CorrectedArm, result: FitResult, result_sha256: str) -> str:
-    """Text of compensation.json of a corrected arm of a fit, sensors on the tool included."""
+    """Return the text of compensation.json for a fit's corrected arm, with sensors on the tool."""
     described = replace(described, mounts=mounts_of(result, described.model))
     return written(described, result.session, 'fit', result_sha256)
 
 
 def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[str, str]:
-    """Text of each file of the folder ``apply``, by name.
+    """Return the text of each file of a discovery's folder ``apply``, by name.
 
-    ``widening``: factor of the predictions; ``result_sha256``: of discovery.json.
+    ``widening``: factor on predicted uncertainties; ``result_sha256``: of discovery.json.
     """
     files = exports(discovery.alone, _remarks(discovery))
     if discovery.loads_geometry:
@@ -161,10 +163,10 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
 
 
 def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
-    """Arm in compensation.json: with all effects if that predicts held-out poses better.
+    """Return the arm that compensation.json describes: with all effects, or zero-offsets alone.
 
-    Causes and zero-offsets belong together: without the causes, the zero-offsets are those that
-    were fitted without them.
+    With all effects if `holds_everything`. Causes and zero-offsets belong together: without
+    the causes, the zero-offsets are those fitted without them, perhaps with lengths and tilts.
     """
     if holds_everything(discovery):
         described = _arm_with_effects(discovery)
@@ -187,10 +189,10 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
 
 
 def holds_everything(discovery: Discovery) -> bool:
-    """Whether compensation.json has all effects of the model, not zero-offsets only.
+    """Return whether compensation.json has all effects of the model, not zero-offsets only.
 
-    If there are causes, its correction converges (slope below 1), and its mean error on held-out
-    poses is smaller at 0.001 mm, or no poses were held out.
+    If the model has effects, its correction converges (slope below 1), and its mean error on
+    held-out poses is smaller at 0.001 mm, or no poses were held out.
     """
     offsets_error = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
@@ -201,7 +203,7 @@ def holds_everything(discovery: Discovery) -> bool:
 
 @lru_cache(maxsize=1)
 def _arm_with_effects(discovery: Discovery) -> CorrectedArm:
-    """Corrected arm with all effects that can be corrected."""
+    """Return the corrected arm with all effects of the model that commands can correct; cached."""
     return arm_of_effects(discovery.fit, discovery.solution.candidates, discovery.residuals)
 
 
@@ -242,7 +244,10 @@ def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
 
 
 def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
-    """Mean error on held-out poses without gross errors, mm; NaN if there are none."""
+    """Mean length of errors on held-out poses, mm, gross errors left out; NaN if none are left.
+
+    ``errors``: of every measurement of the session, m, (n, 3).
+    """
     m = discovery.residuals.context.measurements
     gross = [observation for observation, _ in discovery.outliers]
     return 1e3 * mean_length(errors[m.is_validation & ~np.isin(m.observation, gross)])

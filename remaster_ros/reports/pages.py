@@ -47,10 +47,10 @@ def law(effect: FoundEffect) -> str:
 
 
 def page(template: str, **content: Any) -> str:
-    """Text of a page from a template of this package, with all content escaped.
+    """Render a template of this package to the text of a page; all content is escaped.
 
-    ``template``: its file name; ``content``: its variables. Raises jinja2.UndefinedError if one is
-    missing.
+    ``template``: its file name; ``content``: its variables. Raises jinja2.UndefinedError if
+    one is missing.
     """
     environment = Environment(
         autoescape=True,
@@ -86,7 +86,10 @@ def page(template: str, **content: Any) -> str:
 
 
 def summarized(effect: Mapping[str, Any]) -> Markup:
-    """A cause with its size in brackets, as HTML; ``effect``: as discovery.json has it."""
+    """Return a cause's sentence with its size in brackets, as HTML.
+
+    ``effect``: as discovery.json has it.
+    """
     size = size_words(msgspec.convert(effect, FoundEffect))
     return Markup('{} <span class="soft">({})</span>').format(effect['cause'], size)
 
@@ -97,7 +100,10 @@ def _template(name: str) -> str:
 
 
 def inlined(name: str, svg: str) -> Markup:
-    """A figure as part of a page: with the page's colours, font, width, and unique identifiers."""
+    """Return an SVG figure for insertion into a page: with the page's colours, font and width.
+
+    ``name``: prefix that makes its identifiers unique; ``svg``: its text.
+    """
     svg = svg[svg.index('<svg') :]
     for color, ours in ((INK, 'var(--ink)'), (GRID, 'var(--line)'), (PAPER, 'none')):
         svg = svg.replace(color, ours)
@@ -109,7 +115,7 @@ def inlined(name: str, svg: str) -> Markup:
 
 
 def compressed(text: str) -> str:
-    """Text gzip-compressed and in base64, for the pages to unpack; reproducible."""
+    """Return a text gzip-compressed and in base64, for pages to unpack; always the same."""
     # The highest level takes twice as long, for a hundredth less.
     return base64.b64encode(gzip.compress(text.encode(), 5, mtime=0)).decode()
 

@@ -27,7 +27,7 @@ agreement."""
 
 
 class PlannedRow(NamedTuple):
-    """Planned and recorded configurations of a split, and numbers of lost ones by reason."""
+    """Numbers of planned and recorded configurations of a split, and of lost ones by reason."""
 
     words: str
     poses: int
@@ -47,7 +47,7 @@ class StdRow(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanFacts:
-    """Facts of a plan for the page."""
+    """Facts of a collection's plan for a report: counts, losses, time, and precision reached."""
 
     name: str  # Fingerprint of the plan
     rows: tuple[PlannedRow, ...]  # One for each split
@@ -64,7 +64,7 @@ class PlanFacts:
 
     @property
     def verdict(self) -> str:
-        """Sentence on expected and reached standard deviations; '' if unknown.
+        """Sentence comparing the standard deviations reached with those expected; '' if unknown.
 
         Within a factor of 1.5 (`AS_EXPECTED`) they agree.
         """
@@ -86,10 +86,10 @@ class PlanFacts:
 
 
 def plan_facts(inputs: Inputs) -> PlanFacts | None:
-    """Facts of the session's plan for the page; None if it has none.
+    """Return the facts of the session's plan for the page; None if it has none.
 
-    Numbers by split, reasons of dropped poses, minutes that it took (None without times), expected
-    and reached standard deviations and their median ratio.
+    Numbers by split, reasons of dropped poses, minutes that it took (None without times),
+    expected and reached standard deviations and their median ratio.
     """
     plan, session = inputs.plan, inputs.session
     if plan is None:
@@ -139,9 +139,10 @@ def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
 
 
 def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
-    """Expected and reached standard deviation of each joint's offset, deg or mm.
+    """Return the expected and the fit's standard deviation of each joint's offset, deg or mm.
 
-    Those of the model alone, of an arm exactly as drawn. () if none were expected.
+    The fit's is that of the model alone, for an arm exactly as drawn; None if not
+    identifiable. () if none were expected.
     """
     if plan.expected is None:
         return ()
@@ -161,7 +162,7 @@ def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
 
 
 def drawn_plan(plan: RecordedPlan) -> bytes:
-    """Page that plays the plan, if the planner left one with the session; b'' otherwise."""
+    """Return the page that plays the plan, if the planner left one with the session; else b''."""
     from remaster_ros.collection.plan_confirmation import fingerprint
     from remaster_ros.reports.plan_page import read_plan_page
 
@@ -182,7 +183,7 @@ def copy_plan(plan: RecordedPlan | None, folder: Path) -> None:
 
 
 def plan_to_dict(plan: PlanFacts) -> dict[str, Any]:
-    """Facts of a plan in ``remaster report --json``."""
+    """Return the facts of a plan as ``remaster report --json`` has them."""
     return {
         'name': plan.name,
         'splits': [row._asdict() for row in plan.rows],

@@ -22,12 +22,13 @@ HELD_OUT = 'validation'
 
 
 def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
-    """Output of ``remaster plan --json``.
+    """Return the output of ``remaster plan --json``.
 
     ``robot_time_s`` is that of the whole session: registration, fitted and held-out poses, and
-    references. ``dropped`` counts poses that lost all their solutions, ``dropped_configurations``
-    solutions. Prismatic joints are in ``expected_std_mm`` in place of ``expected_std_deg``.
-    ``expected_tool_std_mm`` is the RMS 3-D error of the predicted markers.
+    references. ``dropped`` counts poses that lost all their solutions,
+    ``dropped_configurations`` solutions. Prismatic joints are in ``expected_std_mm`` in place
+    of ``expected_std_deg``. ``expected_tool_std_mm`` is the RMS 3-D error of the predicted
+    markers.
     """
     visits = Counter(visit.split for visit in plan.visits)
     design = plan.design_result
@@ -62,7 +63,7 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 
 
 def _moving(plan: CollectionPlan, design: MovingDesign) -> dict[str, Any]:
-    """Curves of a plan: times, places, share of the time in sight, and the fastest joint."""
+    """Return the key moving of a plan: times of its curves, share in sight, largest speeds."""
     chain = plan.tour.chain
     joint, speed = design.max_joint_speed
     return {
@@ -81,7 +82,11 @@ def _moving(plan: CollectionPlan, design: MovingDesign) -> dict[str, Any]:
 
 
 def _separated(design: SeparatingDesign) -> dict[str, Any]:
-    """Configurations that separate causes, degrees, and how far apart these are, in stds."""
+    """Return the key separate of a plan: configurations that separate causes, and each pair.
+
+    Configurations in degrees; of each pair how far apart the causes are without and with them,
+    in standard deviations.
+    """
     return {
         'configurations': sum(len(pose.solutions) for pose in design.poses),
         'q_deg': [
@@ -106,7 +111,7 @@ def _at_poses(configurations: int, poses: int) -> str:
 
 
 def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
-    """A plan as text, one subject a line: counts, time, expected precision, goal if missed."""
+    """Return a plan as text, a subject a line: counts, time, expected precision, missed goal."""
     visits = Counter(visit.split for visit in plan.visits)
     poses = plan.poses
     if plan.moving_design is not None:
@@ -138,7 +143,10 @@ def plan_text(plan: CollectionPlan, settings: DesignSettings) -> str:
 
 
 def _moving_text(plan: CollectionPlan, design: MovingDesign, settings: DesignSettings) -> str:
-    """A plan with curves as text, one subject a line."""
+    """Return a plan with curves (measured in motion) as text, one subject a line.
+
+    Times, counts, speeds, expected precision, and the goal if it is missed.
+    """
     visits, found = Counter(visit.split for visit in plan.visits), _moving(plan, design)
     lines = [
         f'to fit: {design.moving_s:.1f} s of motion, measured all along: '
@@ -177,7 +185,10 @@ def _moving_text(plan: CollectionPlan, design: MovingDesign, settings: DesignSet
 
 
 def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
-    """A plan without paths, with those keys of `plan_to_dict` that need none."""
+    """Return a plan without paths as a dict: those keys of `plan_to_dict` that need no paths.
+
+    Its splits have 'configurations' in place of 'visits'.
+    """
     return {
         'configurations': sum(tour.configurations.values()),
         'poses': sum(tour.poses.values()),
@@ -263,9 +274,9 @@ def minutes_text(seconds: float) -> str:
 
 
 def missed_goal(plan: CollectionPlan) -> str:
-    """Sentence that an optimal design does not reach its goal, with a remedy.
+    """Return a sentence that an optimal design does not reach its goal, with a remedy.
 
-    '' if it does, or without such a design.
+    '' if it reaches it, or if the plan has no such design.
     """
     if plan.design_result is None or plan.goal_reached:
         return ''

@@ -49,7 +49,7 @@ def plan_page(
     registered: bool = False,
     confirm: str = '',
 ) -> str:
-    """HTML of the page.
+    """Return the HTML of a plan's page.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def check_plan_page(path: Path) -> None:
 
 
 def read_plan_page(path: Path, plan: str) -> bytes:
-    """Page of a plan that waits for a confirmation.
+    """Read the page of a plan from a file, as bytes.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def read_plan_page(path: Path, plan: str) -> bytes:
 
 
 def write_plan_page(path: Path, html: str) -> None:
-    """Write the page; only a page of a plan is replaced.
+    """Write the HTML of a plan's page to a file; of existing files only such a page is replaced.
 
     Raises
     ------
@@ -176,7 +176,10 @@ def write_plan_page(path: Path, html: str) -> None:
 
 
 def _points(plan: CollectionPlan) -> list[str]:
-    """Warnings on a plan, sentences: goal missed, fit undetermined, unreached configurations."""
+    """Return warnings on a plan as sentences, [] if there are none.
+
+    On a missed goal, an undetermined fit, and configurations that no path reaches.
+    """
     points = [missed_goal(plan)]
     if plan.undetermined:
         points.append(f'A fit of these configurations states nothing: {plan.undetermined}')
@@ -186,7 +189,7 @@ def _points(plan: CollectionPlan) -> list[str]:
 
 
 def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
-    """Words and counts of each split that has visits, in the order of `WORDS`."""
+    """Return a row for each split that has visits: words and counts, in the order of `WORDS`."""
     rows = []
     for split, (words, why) in WORDS.items():
         visits = [visit for visit in plan.visits if visit.split == split]
@@ -201,7 +204,7 @@ def _splits(plan: CollectionPlan) -> list[dict[str, Any]]:
 
 
 def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
-    """Numbers of dropped poses and configurations by reason, (poses, configurations).
+    """Return the numbers of dropped poses and configurations, reason -> (poses, configurations).
 
     The most frequent reason, by the larger of the two, first.
     """
@@ -213,7 +216,7 @@ def _dropped(plan: CollectionPlan) -> dict[str, tuple[int, int]]:
 
 
 def _joints(plan: CollectionPlan, chain: SerialChain) -> list[dict[str, Any]]:
-    """Expected std, range over the visits, and limits of each joint, deg or mm."""
+    """Return expected std, range over the visits, and limits of each joint, deg or mm."""
     q = chain.shown_scale * np.array([visit.q for visit in plan.visits])
     return [
         {
@@ -257,7 +260,11 @@ def _played(plan: CollectionPlan, scene: RobotScene) -> dict[str, Any]:
 
 
 def _way(trajectory: Trajectory) -> dict[str, Any]:
-    """Corners of lines, and the rate of each; or samples of a curve, and their times, s."""
+    """Return the path of a trajectory as plan_page.js plays it.
+
+    Of straight lines 'way', the corners after the first, and 'rates', one for each line; of a
+    curve 'way', samples of it, and 'times' of these, s.
+    """
     if trajectory.is_curve:
         times = np.append(
             np.arange(SAMPLE_S, trajectory.duration_s, SAMPLE_S), trajectory.duration_s

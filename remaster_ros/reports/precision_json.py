@@ -16,7 +16,7 @@ FORMAT = 'remaster-precision/1'
 
 
 class Known(Struct):
-    """Precision after a number of configurations; None if unknown."""
+    """Precision of a fit after a number of configurations; None for what is unknown."""
 
     configurations: int
     minutes: float | None
@@ -29,7 +29,10 @@ class Known(Struct):
 
 
 class Precision(Struct):
-    """Precision at all looks so far, the newest last, in degrees, millimetres and minutes."""
+    """Message on /remaster/precision: precision at all looks so far, newest last, and the goal.
+
+    In degrees, millimetres and minutes.
+    """
 
     format: str = FORMAT
     goal: dict[str, float | None] = {}
@@ -42,9 +45,9 @@ class Precision(Struct):
 
 
 def precision_json(rule: StoppingRule, looks: Sequence[Look]) -> str:
-    """Text of JSON of at least one look, and of the stopping rule's result for the newest.
+    """Return the JSON of `Precision`: all looks, and what the stopping rule says of the newest.
 
-    Units as of `Precision`; unknown values are null.
+    ``looks``: at least one, newest last. Unknown values are null.
     """
     last, goal = looks[-1], rule.goal
     found = Precision(

@@ -30,7 +30,7 @@ NOISE_UNKNOWN = 'May be sensor noise alone'
 
 
 class Remaining(NamedTuple):
-    """An error that the action leaves: name, size in words, and remedy."""
+    """Error that is left after a report's action: name, size in words, and remedy."""
 
     what: str
     size: str
@@ -44,10 +44,10 @@ class Remaining(NamedTuple):
 
 
 def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Remaining]:
-    """Errors that the action leaves, the causes first; at least one entry.
+    """Return the errors that are left after a report's action, causes first; at least one.
 
-    ``loads_model``: whether the action is to load the robot model, which takes its causes out;
-    ``held_out``: whether poses were held out.
+    ``loads_model``: whether the action is to load the robot model, which corrects the causes
+    in it; ``held_out``: whether poses were held out.
     """
     found, judgement = inputs.found, inputs.judgement
     rows = [] if found is None else _of_discovery(found, loads_model)
@@ -101,9 +101,10 @@ def what_remains(inputs: Inputs, loads_model: bool, held_out: bool) -> list[Rema
 
 
 def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
-    """Causes that remain, and errors without a cause.
+    """Return the causes of a discovery that remain, and its errors without a cause.
 
-    At most 4 causes (`MOST_NAMED`); the smaller ones share one entry.
+    At most 4 causes (`MOST_NAMED`); the smaller ones share one entry. ``loads_model``: leave
+    out causes that the robot model corrects.
     """
     rows: list[Remaining] = []
     stay = [e for e in found.effects if not (loads_model and e.in_robot_model)]
@@ -129,7 +130,7 @@ def _of_discovery(found: Discovered, loads_model: bool) -> list[Remaining]:
 
 
 def _gross(inputs: Inputs) -> Remaining | None:
-    """Number, sensors and time of the gross errors; None if there are few.
+    """Return an entry on the number, sensors and time of the gross errors; None if they are few.
 
     Few: below 3 (`FEWEST_GROSS`) or below 1 % of all readings (`LEAST_SHARE`).
     """

@@ -49,7 +49,7 @@ SVG_ELEMENTS = {
 
 
 class WorstRow(NamedTuple):
-    """A row with a large error."""
+    """Row of a session with a large error, for a report's table: numbers, place, errors."""
 
     observation: int
     pose: int
@@ -87,8 +87,8 @@ def write_answer(
     Raises
     ------
     InputError
-        The folder has the report of another command or cannot be written to, or the library for
-        PDF is missing.
+        The folder has the report of another command or cannot be written to, a file to apply or a
+        figure of the results cannot be used, or the library for PDF is missing.
     """
     printer = require_ready(folder, pdf)
     answer = answer_of(inputs)
@@ -121,7 +121,9 @@ def write_answer(
 
 
 def require_ready(folder: Path, pdf: bool) -> Any:
-    """Library for PDF if asked for, else None; checks the destination before the long work.
+    """Check the destination of a report before the long work; return the library for PDF.
+
+    None unless ``pdf``.
 
     Raises
     ------
@@ -142,7 +144,10 @@ def require_ready(folder: Path, pdf: bool) -> Any:
 
 
 def answer_html(subject: Subject, drawings: dict[str, Markup], printing: bool = False) -> str:
-    """Text of a report's page; ``drawings``: figures as HTML by name; ``printing``: for PDF."""
+    """Return the text of a report's page.
+
+    ``drawings``: figures as HTML by name; ``printing``: for PDF.
+    """
     inputs, answer = subject.inputs, subject.answer
     fit = msgspec.to_builtins(inputs.fit)
     found = msgspec.to_builtins(inputs.found) if inputs.found is not None else None
@@ -184,9 +189,10 @@ def _chain(inputs: Inputs) -> SerialChain:
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
-    """Further remarks on the fit, on the model with causes, and on the other session, a line each.
+    """Return further remarks on the fit, the model with causes, and the other session.
 
-    Findings that the causes answer, and disagreements that are listed elsewhere, are left out.
+    A line each. Left out are findings that the causes answer, and disagreements, which are
+    listed elsewhere.
     """
     judgement, found = inputs.judgement, inputs.found
     answered = judgement.findings if found is not None else []
@@ -198,7 +204,10 @@ def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
 
 
 def measured_when(inputs: Inputs) -> str:
-    """Times of the first and the last reading (UTC); the session's date without clock times."""
+    """Return the times of the first and the last reading (UTC) as text.
+
+    The session's date if it has no clock times.
+    """
     stamps = inputs.session.measurements.stamp_s
     if inputs.session.timed and (first := clock_time(float(stamps.min()))):
         last = clock_time(float(stamps.max()))
@@ -207,14 +216,17 @@ def measured_when(inputs: Inputs) -> str:
 
 
 def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
-    """Number of gross errors among the rows to fit, of the model that the answer uses."""
+    """Return the number of gross errors among the rows to fit, in the fit that the answer uses."""
     m = inputs.session.measurements
     left_out = inputs.gross if answer.uses_causes else list(inputs.fit_left_out)
     return int(np.sum(~m.is_validation & np.isin(m.observation, left_out)))
 
 
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
-    """The 10 rows (`WORST_ROWS`) with the largest errors after the action, the largest first."""
+    """Return the rows with the largest errors after the action, at most 10 (`WORST_ROWS`).
+
+    The largest first.
+    """
     session, m = inputs.session, inputs.session.measurements
     final = answer.final_mm
     frames = inputs.T_R_N
@@ -269,9 +281,10 @@ def _copy_apply(
 
 
 def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
-    """Texts of those figures (SVG) of a fit or a discovery in a folder that exist, by name.
+    """Return the texts of the SVG figures in a folder of results, by name; missing ones left out.
 
-    Raises InputError if one has more than a drawing.
+    ``names``: those to look for. Raises InputError if one has more than a drawing, see
+    `checked_svg`.
     """
     texts = {}
     for name in names:
@@ -283,9 +296,10 @@ def _figures_of(folder: Path, names: Sequence[str]) -> dict[str, str]:
 
 
 def checked_svg(text: str, path: Path) -> str:
-    """Text of a figure, unchanged. Raises InputError if it has more than a drawing.
+    """Return the text of a figure, unchanged, if it is safe to insert into a page.
 
-    More: scripts, links or styles that load something, or elements not in `SVG_ELEMENTS`.
+    Raises InputError if it is no XML, or has more than a drawing: scripts, links or styles
+    that load something, or elements not in `SVG_ELEMENTS`.
     """
     try:
         root = ElementTree.fromstring(text)
@@ -304,7 +318,10 @@ def checked_svg(text: str, path: Path) -> str:
 
 
 def as_image(svg: str) -> Markup:
-    """SVG figure as an embedded <img>: it keeps its colours, whatever the styles of the page."""
+    """Return an SVG figure as an HTML <img> with the figure embedded.
+
+    It keeps its colours, whatever the styles of the page.
+    """
     data = base64.b64encode(svg.encode()).decode()
     return Markup('<img alt="" src="data:image/svg+xml;base64,{}">').format(data)
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Session and results that a report is made of; n rows."""
+    """Session and results (fit, discovery, plan) that a report is made of; n rows."""
 
     session: Session
     # Contents of fit.json and discovery.json (None without the latter)
@@ -82,9 +82,10 @@ class Inputs:
 
 
 def located(path: Path) -> Path:
-    """File fit.json or discovery.json at a path, or in a folder.
+    """Return the path of fit.json or discovery.json, given the file or its folder.
 
-    Raises InputError if a folder has both or neither.
+    A path that is no folder is returned as it is. Raises InputError if a folder has both or
+    neither.
     """
     if not path.is_dir():
         return path
@@ -98,12 +99,14 @@ def located(path: Path) -> Path:
 
 
 def parts(paths: Sequence[Path]) -> tuple[Path | None, Path | None]:
-    """Paths of fit.json and of discovery.json among at most two paths; None if absent.
+    """Return the paths of fit.json and of discovery.json among some paths; None if absent.
+
+    ``paths``: files, or folders of one of them.
 
     Raises
     ------
     InputError
-        Two files of one kind, or a file of another name.
+        Two files of one kind, a file of another name, or a folder with both or neither.
     """
     found: dict[str, Path] = {}
     for path in map(located, paths):
@@ -165,17 +168,17 @@ def read_inputs(
 
 
 def _file_of(source: Loadable | FittedGeometry | msgspec.UnsetType) -> str:
-    """File of a loadable result; '' if there is none."""
+    """Return the file name of a loadable result; '' if it has none, or is unset."""
     return '' if isinstance(source, msgspec.UnsetType) else source.file
 
 
 def _model(
     session: Session, result: Path, file: str, verb: str
 ) -> tuple[Path | None, FloatArray | None]:
-    """Path of a result's robot model, and the errors of all rows with it, mm, (n,).
+    """Return the path of a result's robot model, and the error of each row with it, mm, (n,).
 
-    Both None if ``file`` (as the result names it) is ''. ``result``: path of the result; ``verb``:
-    command that writes it. Raises InputError if the model is missing.
+    (None, None) if ``file``, as the result names it, is ''. ``result``: path of the result;
+    ``verb``: command that writes it. Raises InputError if the model is missing.
     """
     if not file:
         return None, None
@@ -185,17 +188,18 @@ def _model(
 
 
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
-    """3-D error of each row with the robot model of a URDF (text), mm, (n,).
+    """Return the 3-D error of each row with a robot model, mm, (n,).
 
-    As of `errors_with_urdf`: registrations and markers are fitted, offsets are 0.
+    ``urdf``: its text. As `errors_with_urdf`: registrations and markers are fitted, offsets
+    are 0.
     """
     return lengths_mm(errors_with_urdf(session, urdf))
 
 
 def _require_same(session: Session, result: Fit | Discovered, path: Path, verb: str) -> None:
-    """Raise InputError for the result of other data, or of a version that lacks needed keys.
+    """Raise InputError if a result is of other data, or of a version that lacks needed keys.
 
-    ``verb``: command of the remedy.
+    ``path``: of the result; ``verb``: command that the message names as remedy.
     """
     if (
         not isinstance(result.session, msgspec.Struct)

@@ -34,9 +34,10 @@ EXACTLY_DRAWN = 'if the arm is exactly its drawing'
 
 
 def fit_lines(fit: Fit) -> list[str]:
-    """Offsets, errors and verdict of a fit, a line each; the fit has to have a judgement.
+    """Return the lines of a fit for the terminal: offsets, errors, clocks, judgement.
 
-    Then clocks, geometry and gross errors, if there are any.
+    Then geometry, missing times and gross errors, if there are any. AssertionError for a fit
+    without a judgement.
     """
     assert isinstance(fit.judgement, Judgement)
     width = max(len(row.joint) for row in fit.joint_offsets)
@@ -72,7 +73,10 @@ def fit_lines(fit: Fit) -> list[str]:
 
 
 def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
-    """Lines on how late the stamps of each sensor are, and what to do; [] without clocks."""
+    """Return a line for each sensor on how late its stamps are, and what to do.
+
+    [] without clocks.
+    """
     if not isinstance(clocks, dict):
         return []
     return [
@@ -84,7 +88,7 @@ def clock_lines(clocks: dict[str, Clock] | UnsetType) -> list[str]:
 
 
 def _offset(row: JointOffset) -> str:
-    """Offset of a joint ± its std as text, or why it is not identifiable."""
+    """Return the offset of a joint ± its std as text, or why it is not identifiable."""
     if not row.identifiable:
         return f'   not identifiable: {in_a_line(row.why)}'
     mean, std, drawn = (
@@ -95,9 +99,10 @@ def _offset(row: JointOffset) -> str:
 
 
 def _to_load(rows: Sequence[Loadable], effects: Sequence[FoundEffect] = ()) -> list[str]:
-    """Lines on the results that can be loaded: name, error on held-out poses, file.
+    """Return a line for each result that can be loaded: name, error on held-out poses, file.
 
-    ``effects``: causes, of which measuring errors that were taken out are mentioned.
+    ``effects``: causes; if errors of the measurement among them are taken out, the line says
+    so.
     """
     lines = []
     for row in rows:
@@ -114,7 +119,12 @@ def _to_load(rows: Sequence[Loadable], effects: Sequence[FoundEffect] = ()) -> l
 
 
 def discovery_lines(found: Discovered) -> list[str]:
-    """Verdict, causes, loadable results, and coverage of held-out rows, in lines."""
+    """Return the lines of a discovery for the terminal.
+
+    Verdict, causes with look-alikes, unexplained errors, loadable results, coverage of
+    held-out rows, and what another session shows. AssertionError for a discovery without a
+    judgement.
+    """
     assert isinstance(found.judgement, Judgement)
     lines = [f'verdict: {found.verdict}', found.judgement.headline, *clock_lines(found.clocks)]
     for effect in found.effects:

@@ -36,7 +36,7 @@ _FINEST_M, _COARSEST_M = 5e-4, 0.05
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles that move together."""
+    """Triangles, with a name and a role, that move together with one link of the arm."""
 
     name: str  # Name for people
     link: int  # 0 for a fixed surface, i for one that moves with joint i
@@ -50,7 +50,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class RobotScene:
-    """An arm, its tool and its surroundings."""
+    """Arm, tool and surroundings as surfaces for a 3-D picture."""
 
     chain: SerialChain  # The arm
     surfaces: Sequence[Surface]
@@ -59,16 +59,19 @@ class RobotScene:
     notes: Sequence[str]  # Parts not drawn as in the robot description, and the remedy
 
     def transforms(self, q: FloatArray) -> FloatArray:
-        """Poses of the links at joint angles (..., k), rad: T_R_link, (..., k + 1, 4, 4).
+        """Return the poses of the links, T_R_link, (..., k + 1, 4, 4); the first is the base's.
 
-        The first is that of the base, the identity.
+        ``q``: joint positions, rad or m, (..., k). That of the base is the identity.
         """
         frames = self.chain.frames(q)
         base = np.broadcast_to(np.eye(4), (*frames.shape[:-3], 1, 4, 4))
         return np.concatenate((base, frames), axis=-3)
 
     def with_sensors(self, T_R_N: Mapping[str, FloatArray]) -> RobotScene:
-        """Scene with sensors at their measured poses T_R_N, (4, 4) each; others are unchanged."""
+        """Return a copy with sensors at their measured poses T_R_N, (4, 4) each.
+
+        Sensors that are not in ``T_R_N`` stay; names that are not in the scene are ignored.
+        """
         sights = [
             replace(sight, sensor_R=T_R_N[sight.sensor][:3, 3]) if sight.sensor in T_R_N else sight
             for sight in self.sights
@@ -77,7 +80,7 @@ class RobotScene:
 
 
 def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
-    """Scene of a cell.
+    """Make the scene of a cell: arm, tool, obstacles and sensors as surfaces.
 
     Parameters
     ----------
@@ -97,10 +100,11 @@ def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
 def arm_surfaces(
     visuals: Sequence[Visual], bodies: Sequence[Body], mesh_parts: MeshParts
 ) -> tuple[list[Surface], list[str]]:
-    """Surfaces of an arm and its surroundings, and notes on parts not drawn as described.
+    """Return surfaces of an arm and its surroundings, and notes on parts not drawn as described.
 
-    Of the ``bodies`` of the collision checks, tool, markers and obstacles are drawn, and the links
-    without visual geometry. ``mesh_parts`` raises InputError for a missing mesh.
+    Of the ``bodies`` of the collision checks, tool, markers and obstacles are drawn, and the
+    links whose visual geometry is missing or cannot be read. ``mesh_parts``: reads a mesh by
+    its name; raises InputError for a missing one.
     """
     surfaces: list[Surface] = []
     missing: dict[str, None] = {}
@@ -126,7 +130,10 @@ def arm_surfaces(
 
 
 def _notes(missing: Sequence[str]) -> list[str]:
-    """Note on meshes that cannot be read; [] if there are none."""
+    """Return a note on geometry that cannot be read, in a list; [] if there is none.
+
+    ``missing``: names of it.
+    """
     if not missing:
         return []
     more = f' and {len(missing) - 1} more' if len(missing) > 1 else ''
@@ -163,16 +170,17 @@ def _drawn(visual: Visual, mesh_parts: MeshParts) -> list[Surface]:
 def coarser(
     vertices: FloatArray, faces: IntArray, most: int = MOST_TRIANGLES
 ) -> tuple[FloatArray, IntArray]:
-    """Mesh with at most `most` triangles, in which vertices near each other are merged.
+    """Return a mesh with at most `most` triangles, in which vertices near each other are merged.
 
-    Vertices of one cell of a grid become their mean, and triangles that lose a corner are dropped
-    (J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering complex scenes",
-    1993); the grid widens until few enough remain. Equal vertices are always merged.
+    Vertices of one cell of a grid become their mean, and triangles that lose a corner are
+    dropped (J. Rossignac and P. Borrel, "Multi-resolution 3D approximations for rendering
+    complex scenes", 1993); the grid widens until few enough remain. Equal vertices are always
+    merged.
 
     Parameters
     ----------
     vertices, faces
-        m, (n, 3), and (m, 3).
+        m, (n, 3), and vertex indices, (m, 3).
     most
         Largest number of triangles; exceeded only if cells of 5 cm leave more.
     """
@@ -186,9 +194,9 @@ def coarser(
 
 
 def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[FloatArray, IntArray]:
-    """Mesh with the vertices of each cell (edge in m) of a grid merged to their mean.
+    """Return a mesh with the vertices of each cell of a cubic grid merged to their mean.
 
-    Triangles that lose a corner, and repeated ones, are dropped.
+    ``cell``: edge of a cell, m. Triangles that lose a corner, and repeated ones, are dropped.
     """
     steps = np.round((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
     _, index = np.unique(_numbered(steps), return_inverse=True)
@@ -203,21 +211,28 @@ def _clustered(vertices: FloatArray, faces: IntArray, cell: float) -> tuple[Floa
 
 
 def _numbered(rows: IntArray) -> IntArray:
-    """A number for each different row of three numbers from 0 on, (n, 3) to (n,)."""
+    """Return a number for each row of three whole numbers, equal only for equal rows, (n,).
+
+    ``rows``: 0 or more, (n, 3). The numbers are not consecutive.
+    """
     size = rows.max(axis=0, initial=0) + 1
     return (rows[:, 0] * size[1] + rows[:, 1]) * size[2] + rows[:, 2]
 
 
 def _used(points: FloatArray, faces: IntArray) -> tuple[FloatArray, IntArray]:
-    """Points that occur in triangles, (n, 3), and the triangles with the new indices, (m, 3)."""
+    """Return the points that triangles use, and the triangles with the new indices.
+
+    (p, 3) and (m, 3).
+    """
     used, renumbered = np.unique(faces, return_inverse=True)
     return points[used], renumbered.reshape(-1, 3).astype(np.int64)
 
 
 def _hull(shape: Shape) -> tuple[FloatArray, IntArray]:
-    """Surface of a convex shape in its own frame: vertices, m, (n, 3), and triangles, (m, 3).
+    """Return the surface of a convex shape in its own frame: vertices and triangles.
 
-    Triangles are vertex indices, counter-clockwise seen from outside.
+    Vertices: m, (n, 3); triangles: vertex indices, counter-clockwise seen from outside, (m,
+    3).
     """
     points = shape.outline
     if shape.ball > 0.0:

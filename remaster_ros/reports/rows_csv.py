@@ -40,9 +40,10 @@ PREDICTION_COLUMNS = (
 
 
 def rows_text(session: Session, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Text of a CSV file: identity (`IDENTITY`) of each row of the session, then columns.
+    """Return the text of a CSV file with a line for each row of a session.
 
-    ``rows``: values of the columns, in the order of the measurements.
+    First the row's identity (`IDENTITY`), then ``columns``. ``rows``: values of these, in the
+    order of the measurements.
     """
     m = session.measurements
     text = io.StringIO()
@@ -69,10 +70,10 @@ def lengths_mm(errors: FloatArray) -> FloatArray:
 
 
 def residuals_text(result: FitResult) -> str:
-    """Text of residuals.csv: measured minus modelled position in the frame of the sensor, m.
+    """Return the text of residuals.csv: measured minus modelled position, sensor frame, m.
 
-    ``before`` with all offsets at zero, ``after`` with the offsets; ``left_out`` is 1 for a gross
-    error.
+    ``before`` with all offsets at zero, ``after`` with the offsets; ``left_out`` is 1 for a
+    gross error.
     """
     gross = {observation for observation, _ in result.left_out}
     residuals = np.concatenate((result.residuals_before, result.residuals_after), axis=1)
@@ -86,8 +87,9 @@ def residuals_text(result: FitResult) -> str:
 
 
 def predictions_text(session: Session, predictions: Predictions, left_out: set[int]) -> str:
-    """Text of predictions.csv: positions in the frame of the row's sensor, m; 1 is yes and 0 no.
+    """Return the text of predictions.csv: measured and predicted positions, sensor frame, m.
 
+    With covariance, and held out, left out, and inside the 95 % region as 1 (yes) or 0.
     ``left_out``: ``observation`` of the gross errors.
     """
     m: Measurements = session.measurements
@@ -107,10 +109,10 @@ def predictions_text(session: Session, predictions: Predictions, left_out: set[i
 
 
 def read_columns(path: Path, session: Session, columns: Sequence[str], verb: str) -> FloatArray:
-    """Columns of numbers of such a file, (n, columns), a line for each row of a session.
+    """Read columns of numbers of residuals.csv or predictions.csv, (n, columns).
 
-    Raises InputError if the file is of another session, or a number is missing. ``verb``: command
-    that writes the file.
+    Raises InputError if the file lacks a column, is of another session, or a number is
+    missing. ``verb``: command that writes the file.
     """
     data = read_limited(path, ROWS_LIMIT, f'run "remaster {verb}" again, which writes it')
     reader = csv.DictReader(io.StringIO(decode_text(data, path)))

@@ -24,10 +24,10 @@ _REMEDY = 'install trimesh as constraints.txt has it'
 
 
 def scene_to_dict(scene: RobotScene) -> dict[str, Any]:
-    """Scene in the form that robot_view.js takes; lengths in metres, matrices row by row.
+    """Return a scene in the form that robot_view.js takes; lengths in m, matrices row by row.
 
-    Vertices are 16-bit numbers between the lowest and the highest of their surface (0.02 mm for a
-    link of a metre), these and the triangles in base64.
+    Vertices are 16-bit numbers between the lowest and the highest of their surface (0.02 mm
+    for a link of a metre), these and the triangles in base64.
     """
     chain = scene.chain
     reach = np.linalg.norm(chain.T_fixed[:, :3, 3], axis=1).sum()
@@ -54,7 +54,7 @@ def scene_to_dict(scene: RobotScene) -> dict[str, Any]:
 
 
 def _limit(angle: float) -> float | None:
-    """Limit of a joint; None if infinite."""
+    """Return the limit of a joint, rad or m; None if infinite."""
     return float(angle) if np.isfinite(angle) else None
 
 
@@ -77,12 +77,12 @@ def _surface(surface: Surface) -> dict[str, Any]:
 
 
 def _base64(values: Any, kind: str) -> str:
-    """Values as numbers of a type such as '<u2' (little-endian, 16 bits), in base64."""
+    """Return values as binary numbers in base64; ``kind``: NumPy type, '<u2': 16 bits unsigned."""
     return base64.b64encode(np.asarray(values).astype(kind).tobytes()).decode()
 
 
 def three_js() -> str:
-    """Source of three.js, from the page of trimesh's viewer.
+    """Return the source of three.js, taken from trimesh's viewer.
 
     Raises InputError if it is not there.
     """
@@ -102,7 +102,7 @@ def three_js() -> str:
 
 
 def view_script(*names: str) -> str:
-    """three.js, robot_view.js and the named scripts of this package as one script.
+    """Return three.js, robot_view.js and the named scripts of this package as one script.
 
     Raises InputError if three.js is not there.
     """

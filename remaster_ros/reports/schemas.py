@@ -38,7 +38,7 @@ Mood = Literal['good', 'caution', 'bad']
 
 
 class Counts(Struct):
-    """Numbers of observations, configurations and poses of a split."""
+    """Numbers of observations, configurations and poses among the fitted or held-out rows."""
 
     observations: int
     configurations: int
@@ -46,7 +46,7 @@ class Counts(Struct):
 
 
 class MeasuredSession(Struct):
-    """The session: counts, sensor -> marker, date, exit status, hash, and whether it has times."""
+    """Description of the session: counts, sensors with markers, date, exit status, hash, times."""
 
     optimization: Counts
     validation: Counts
@@ -113,14 +113,17 @@ class SampledParameter(Struct):
 
 
 class Accuracy(Struct):
-    """The three metrics by split; ``validation`` is None if nothing was held out."""
+    """Accuracy metrics of the fitted and of the held-out rows.
+
+    ``validation`` is None if nothing was held out.
+    """
 
     optimization: Mapping[str, Any] | None
     validation: Mapping[str, Any] | None
 
 
 class LeftOut(Struct):
-    """A row that was not fitted, and the reason."""
+    """Number (``observation``) of a row that was not fitted, and the reason."""
 
     observation: int
     why: str
@@ -223,7 +226,7 @@ class FittedGeometry(Struct):
 
 
 class Clock(Struct):
-    """How late a sensor's stamps are beside those of the joint states."""
+    """Delay of a sensor's stamps against those of the joint states, ms, and its std."""
 
     late_ms: float
     std_ms: float
@@ -274,7 +277,7 @@ class Loadable(Struct):
 
 
 class NoiseOfDiscovery(Struct):
-    """Noise as estimated by the search."""
+    """Noise and gross errors as estimated by the search for causes."""
 
     pose_common_fraction: float
     outliers: list[int]

@@ -49,7 +49,10 @@ _MORE = {
 
 
 def hardly_proven(held_out_poses: int) -> str:
-    """Sentence that fewer than 3 poses were held out (`FEWEST_HELD_OUT`); '' if none or enough."""
+    """Return a sentence that only one or two poses were held out; '' for none, or enough.
+
+    Enough: `FEWEST_HELD_OUT`, 3.
+    """
     if not 0 < held_out_poses < FEWEST_HELD_OUT:
         return ''
     return (
@@ -65,18 +68,21 @@ def held_out_poses(session: Session) -> int:
 
 
 def not_counted(gross: int) -> str:
-    """Text such as '3 gross errors not counted'."""
+    """Return a text such as '3 gross errors not counted'; ``gross``: their number."""
     return f'{counted(gross, "gross error")} not counted'
 
 
 def times_smaller(before: float, after: float) -> str:
-    """Text such as '9.0 times smaller'."""
+    """Return a text such as '9.0 times smaller', on an error before and after."""
     times = before / max(after, 1e-9)
     return f'{times:.{1 if times < 10 else 0}f} times smaller'
 
 
 def counts_words(session: MeasuredSession) -> str:
-    """Numbers of fitted and held-out observations, as text."""
+    """Return the numbers of fitted and held-out observations as text.
+
+    With those of their configurations and poses.
+    """
     fitted, held_out = (
         f'({counts.configurations} configurations of {counts.poses} poses)'
         for counts in (session.optimization, session.validation)
@@ -93,9 +99,9 @@ def at_marker(size_m: float) -> str:
 
 
 def size_words(effect: FoundEffect) -> str:
-    """Size of a cause, and the share of the gain that is lost without it, as text.
+    """Return the size of a cause, and the share of the gain that is lost without it, as text.
 
-    '' in files of other programs, which have no size.
+    Without the share if it is unknown; '' in files of other programs, which have no size.
     """
     if np.isnan(effect.size_m):
         return ''
@@ -106,15 +112,18 @@ def size_words(effect: FoundEffect) -> str:
 
 
 def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
-    """Name of a look-alike of a cause, capitalized; one of its parts is named as such."""
+    """Return the name of a cause's look-alike, beginning with a small letter.
+
+    'joint 2 alone' if it is the same effect of fewer joints.
+    """
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
 
 
 def coverage_words(held_out: Coverage, gross: int) -> str:
-    """Share of held-out rows in their predicted regions, as text; '' if there are none.
+    """Return how many held-out rows lie in their predicted 95 % regions, as text.
 
-    ``gross``: number of held-out rows that are gross errors.
+    '' if there are none. ``gross``: number of held-out gross errors, which are not counted.
     """
     if held_out.share is None:
         return ''
@@ -125,7 +134,10 @@ def coverage_words(held_out: Coverage, gross: int) -> str:
 
 
 def std_remark(tolerance_m: float) -> str:
-    """Sentence for files on what the standard deviations of offsets include."""
+    """Return a sentence for files on what the standard deviations of offsets include.
+
+    ``tolerance_m``: by how much links and axes may be off their drawing.
+    """
     return (
         'The standard deviations contain what links and axes that are off their drawing by '
         f'{1e3 * tolerance_m:.2g} mm would do to the offsets.'
@@ -133,9 +145,9 @@ def std_remark(tolerance_m: float) -> str:
 
 
 def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
-    """Clause on what the standard deviations of the offsets contain of links off their drawing.
+    """Return a clause on what links off their drawing add to the offsets' standard deviations.
 
-    ``imitations``: the largest ones, each a link or axis and its effect on a joint.
+    ``imitations``: lengths or tilts to name, each with its effect on a joint.
     """
     moved = '; '.join(
         f'{"link" if imitation.cause == "link_length" else "the axis of joint"} {imitation.of} is '
@@ -159,10 +171,10 @@ def loadable_of_fit(geometry: FittedGeometry) -> list[Loadable]:
 
 
 def load_words(row: Loadable) -> tuple[str, str]:
-    """Name of a loadable result, and its file or why to leave it, as text.
+    """Return the name of a loadable result, and its file or why not to load it, as texts.
 
-    It is left if it has no file, or held-out poses do not show that it is better than a plainer
-    one.
+    Not to be loaded if it has no file, or held-out poses do not show that it is better than a
+    plainer one.
     """
     file = f'{row.file}{_MORE.get(row.result, "")}'
     worse = row.result != 'offsets' and row.held_out_mean_mm is not None and not row.better

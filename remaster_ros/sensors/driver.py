@@ -96,7 +96,7 @@ class Driver(ABC):
         """Disconnect; may be repeated, and called while another thread reads or measures."""
 
     def state(self) -> SensorState:
-        """Present state of the device; called from any thread. By default it is ready."""
+        """Present state of the device; called from any thread. By default ready, no fault."""
         return SensorState()
 
 
@@ -129,7 +129,7 @@ class TriggeredDriver(Driver):
 
     @abstractmethod
     def measure(self, expected: FloatArray | None) -> MarkerReading:
-        """Measure once.
+        """Measure once, and return the reading.
 
         Parameters
         ----------

@@ -22,14 +22,14 @@ GENERIC = 'sensor_markers'
 
 
 def kind_of(node_name: str) -> str:
-    """Longest key of `DRIVERS` with which a node's name begins; '' for none."""
+    """Longest key of `DRIVERS` with which a node's name begins; '' if it begins with none."""
     return max((kind for kind in DRIVERS if node_name.startswith(kind)), key=len, default='')
 
 
 def load_driver(node_name: str) -> type[Driver]:
-    """Driver for the node of this name.
+    """Driver class of a sensor's node, by the beginning of the node's name (`DRIVERS`).
 
-    Raises InputError if no registered sensor's name begins the node's name.
+    Raises InputError if the name begins with none of the keys.
     """
     kind = kind_of(node_name)
     if not kind:

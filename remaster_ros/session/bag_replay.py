@@ -45,7 +45,7 @@ _COUNTED = ('observation', 'configuration', 'frame')
 
 
 class _Keeper:
-    """Writes the session at once."""
+    """Keeper of a replay: writes the session at once, and passes errors on."""
 
     full = ''
 
@@ -69,7 +69,7 @@ class _Keeper:
 
 
 class _Log(Outlet):
-    """Logs warnings and errors of the session recorder."""
+    """Outlet of a replay: logs warnings and errors of the session recorder, and drops all else."""
 
     def log(self, level: int, text: str) -> None:
         """Log a line of level warning or above, as in `logging`; others are dropped."""
@@ -79,7 +79,7 @@ class _Log(Outlet):
 
 @dataclass(frozen=True)
 class Replayed:
-    """Results of the replay of a bag."""
+    """Result of the replay of a bag: number of rows, outcomes, and bytes cut off at its end."""
 
     # Number of rows written.
     observations: int
@@ -95,9 +95,10 @@ def bag_folder(path: Path) -> Path:
 
 
 def session_beside(bag: Path) -> Path | None:
-    """Return the session folder that contains a bag (folder or file); None if there is none.
+    """Return the session folder that contains a bag; None if the folder there is no session.
 
-    That is the folder above the bag's, if it has a session.yaml.
+    ``bag``: folder, or file in it. The session is the folder above the bag's folder, if it has
+    a session.yaml.
     """
     folder = (bag if bag.is_dir() else bag.parent).absolute().parent
     return folder if (folder / HEADER).exists() else None
@@ -111,10 +112,10 @@ def record_from_bag(
 ) -> Replayed:
     """Write the session of a recorder's bag into a folder, by the messages in order.
 
-    ``out``: the session folder, new or empty; ``cell``: replaces the cell in the bag;
-    ``progress``: called with the share that is done. A session that the bag does not close is
-    closed as stopped. Raises InputError if the bag is not a recorder's or lacks its cell, a
-    message is damaged, or the folder is not empty.
+    ``out``: the session folder, new or empty; ``cell``: replaces the cell in the bag, None to
+    take that; ``progress``: called with the share that is done. A session that the bag does
+    not close is closed as stopped. Raises InputError if the bag is not a recorder's, it lacks
+    its cell and none is given, a message is damaged, or the folder is not empty.
     """
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out}: there is something already; name a new folder for the session')
@@ -148,10 +149,11 @@ def record_from_bag(
 
 
 def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[Any], object]]:
-    """Return the function that takes the messages of each topic, by absolute topic name.
+    """Return the function that takes the messages of a topic, by absolute topic name.
 
-    Joint states, settled, joint solutions; for each sensor its temperature and its markers, or the
-    poses in place of the markers if it has them.
+    Topics are those of joint states, of a settled arm and of joint solutions; and for each
+    sensor its temperature and its markers, or its poses in place of the markers if it has
+    them.
     """
     take: dict[str, Callable[[Any], object]] = {
         '/joint_states': recorder.take_joints,
@@ -189,9 +191,10 @@ def _records(bag: BagReader, kind: str, data: bytes) -> list[events.EventRecord]
 
 
 def _first_start(bag: BagReader) -> tuple[events.RecorderBegan, Workcell | None]:
-    """Return the first start of a recorder in a bag, and its cell, None if the bag lacks it.
+    """Return the record of the first start of a recorder in a bag, and the cell in that record.
 
-    Raises InputError if no recorder wrote the bag.
+    The cell is None if the record has none. Raises InputError if no recorder wrote the bag, or
+    the cell is of another version.
     """
     for topic, kind, data, _ in bag:
         if topic != EVENTS:
@@ -234,11 +237,12 @@ def _parameters(bag: BagReader, began: events.RecorderBegan) -> Parameters:
 
 
 def differences(session: Path, other: Path) -> list[str]:
-    """Return the differences between a session and the replay of its bag, one line per row.
+    """Return the differences between a recorded session and the replay of its bag, a line per row.
 
-    [] if there are none. Rows are matched by pose, split, sensor, marker and previous
-    configuration, so that a missing row is reported alone; numbers of observation, configuration
-    and frame are not compared. Raises InputError if an observations.csv cannot be read.
+    ``session``, ``other``: folders of the recorded and of the replayed session. [] if there
+    are none. Rows are matched by pose, split, sensor, marker and previous configuration, so
+    that a missing row is reported alone; numbers of observation, configuration and frame are
+    not compared. Raises InputError if an observations.csv cannot be read.
     """
     ours, theirs = _rows(session), _rows(other)
     found = []
@@ -259,9 +263,10 @@ def differences(session: Path, other: Path) -> list[str]:
 
 
 def _rows(session: Path) -> dict[tuple[str, ...], dict[str, str]]:
-    """Observations of a session, column -> text, by pose, split, sensor, marker and last joints.
+    """Rows of a session's observations.csv, column -> text, by what identifies a row.
 
-    A number is added to the key for repeated ones. Raises InputError if the file cannot be read.
+    Key: pose, split, sensor, marker, previous joints and a counter for repeated keys. Raises
+    InputError if the file cannot be read.
     """
     path = session / ROWS
     data = read_limited(path, OBSERVATIONS_LIMIT, 'it is part of a session')

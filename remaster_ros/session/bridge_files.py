@@ -78,7 +78,7 @@ class HaltFile:
 
 
 class _Kept(msgspec.Struct):
-    """Joints, end of the command (rad), and time it was sent (ns since 1970, UTC)."""
+    """Content of the file of the last command: joints, end, next end, and time of sending."""
 
     joints: list[str]
     end: list[float]
@@ -99,19 +99,19 @@ class LastCommand:
 
     @property
     def places(self) -> FloatArray | None:
-        """Ends between which the arm was led, rad or m, (1 or 2, k): this one, then the next.
+        """End of the command and, if known, of the next piece of its move, rad or m, (1 or 2, k).
 
-        None if unknown.
+        The arm may be anywhere between them. None if the end of the command is unknown.
         """
         ends = [end for end in (self.end, self.next_end) if end is not None]
         return None if self.end is None else np.array(ends)
 
 
 class LastCommandFile:
-    """File with the end of the last command.
+    """File with the joint positions at the end of the last command.
 
     A restarted bridge compares the reported joint positions with it before it moves the arm.
-    ``joints``: names in the order of all positions; other arguments as of `HaltFile`.
+    ``joints``: names, in the order of all positions; other arguments as of `HaltFile`.
     """
 
     def __init__(
@@ -121,10 +121,10 @@ class LastCommandFile:
         self._joints = list(joints)
 
     def read(self, now_ns: int) -> LastCommand | None:
-        """Return the last command, aged to ``now_ns`` (ns since 1970); None if there was none.
+        """Return the last command, with its age at ``now_ns`` (ns since 1970); None if none.
 
-        A damaged file gives an unknown end and an infinite age; other joints an unknown end. The
-        age is infinite if the command is later than now.
+        The end is None if the file is damaged or of other joints. The age is infinite if the
+        file is damaged, or the command was sent later than ``now_ns``.
         """
         try:
             if not self.path.exists():
@@ -143,10 +143,10 @@ class LastCommandFile:
         return LastCommand(end, age_s, following)
 
     def write(self, end: FloatArray, sent_ns: int, next_end: FloatArray | None = None) -> None:
-        """Store the end of a command, rad or m, (k,), durably; raise DiskError if that fails.
+        """Store the joint positions at the end of a command, rad or m, (k,), durably.
 
-        ``sent_ns``: time it was sent, ns since 1970; ``next_end``: end of the next piece of its
-        move.
+        ``sent_ns``: time it was sent, ns since 1970; ``next_end``: end of the next piece of
+        the move, None if there is none. Raises DiskError if that fails.
         """
         make_folder(self.path.parent)
         write_atomically(

@@ -23,9 +23,10 @@ _MADE: ContextVar[list[Path] | None] = ContextVar('made', default=None)
 
 @contextlib.contextmanager
 def undone_on_failure() -> Iterator[None]:
-    """Remove all files and folders made in the body if it fails or is interrupted.
+    """Context that removes the new files and folders of its body if that fails or is interrupted.
 
-    Earlier files, and those that others put there meanwhile, remain, with their folder.
+    Those that `made_if_new` registered, as most functions of this module do. Earlier files,
+    and those that others put there meanwhile, remain, with their folder.
     """
     outer, made = _MADE.get(), list[Path]()
     token = _MADE.set(made)
@@ -44,7 +45,7 @@ def undone_on_failure() -> Iterator[None]:
 
 
 def made_if_new(path: Path) -> None:
-    """Register a file or folder that is about to be made, for `undone_on_failure`.
+    """Register a path that is about to be made, so that `undone_on_failure` can remove it.
 
     Nothing happens if the path exists, or outside of `undone_on_failure`.
     """
@@ -319,7 +320,7 @@ def write_all(descriptor: int, data: bytes | bytearray) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names in a folder durable: otherwise a power cut may lose that of a new file.
+    """Make the file names in a folder durable, or a power cut may lose that of a new file.
 
     Raises OSError if that fails.
     """
@@ -348,5 +349,5 @@ def cannot_write(path: Path, error: OSError) -> DiskError:
 
 
 def reason(error: Exception) -> str:
-    """Return an error of the operating system as text without the path."""
+    """Return the reason of an OSError as text, without the path; of another error its text."""
     return getattr(error, 'strerror', None) or str(error)

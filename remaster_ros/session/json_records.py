@@ -16,7 +16,7 @@ Record = TypeVar('Record', bound=msgspec.Struct)
 
 
 def plain(values: Any) -> Any:
-    """Array as nested lists, mapping as a dict (not deeper), for a JSON encoder.
+    """Array as nested lists, or mapping as a dict, whose values stay; for a JSON encoder.
 
     Raises TypeError for other types.
     """
@@ -28,7 +28,7 @@ def plain(values: Any) -> Any:
 
 
 def checked(content: Mapping[str, Any] | msgspec.Struct, record: type[Record]) -> Record:
-    """Content as a record of a type: arrays as lists, NaN as None, unknown keys dropped.
+    """Content converted to a record type: arrays as lists, NaN as None, unknown keys dropped.
 
     Raises msgspec.ValidationError if a key is missing or has another type.
     """
@@ -47,9 +47,10 @@ class _AnyFile(msgspec.Struct):
 
 
 def format_of(data: bytes) -> str | None:
-    """Key ``format`` in the bytes of a JSON file; None if it has none.
+    """Value of the key ``format`` in the bytes of a JSON file; None if it has none.
 
-    What is not looked for is skipped, not built: a hostile file takes no more than its own size.
+    None also if the file is damaged. Other keys are skipped, not built: a hostile file takes
+    no more memory than its own size.
     """
     try:
         return msgspec.json.decode(data, type=_AnyFile).format

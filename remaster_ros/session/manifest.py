@@ -76,17 +76,18 @@ def remove_manifest(folder: Path) -> None:
 
 
 def check_data(sums: Mapping[str, str], path: Path, data: bytes) -> None:
-    """Raise InputError if the content of a listed file is not that which was closed.
+    """Raise InputError if the content of a file differs from its checksum in ``sums``.
 
-    A file that the checksums do not list is accepted.
+    ``sums``: SHA-256 by file name; ``data``: the content. A file that is not listed is
+    accepted.
     """
     _compare(sums, path, hashlib.sha256(data).hexdigest())
 
 
 def check_file(sums: Mapping[str, str], path: Path) -> None:
-    """Raise InputError if a listed file has another checksum than when it was closed.
+    """Raise InputError if the SHA-256 of a file differs from that in ``sums``.
 
-    For files too large to read at once. A file that the checksums do not list is not read.
+    For files too large to read at once. A file that ``sums`` does not list is not read.
     """
     if path.name in sums:
         _compare(sums, path, sha256_of(path))

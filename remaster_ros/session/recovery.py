@@ -19,7 +19,7 @@ from remaster_ros.types import Measurements
 
 @dataclass
 class Recovery:
-    """Findings of a recovery."""
+    """Findings of a recovery: whether anything had to be finished, and what was lost."""
 
     # Whether anything was to be finished; False where the folder was complete.
     finished: bool = False
@@ -62,10 +62,10 @@ def recover_session(folder: str | os.PathLike[str]) -> Recovery:
 
 
 def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> None:
-    """Complete the session files from the journal and close the session; note repairs.
+    """Complete the session files from the journal, close the session, and note the repairs.
 
-    The exit status is kept, 'aborted' if the header has none. Raises InputError as
-    `recover_session`.
+    Losses and repairs go into ``recovery``. The exit status is kept, 'aborted' if the header
+    has none. Raises InputError as `recover_session`.
     """
     urdf, chain = read_robot(folder, header)
     session = header.session(urdf, Measurements.empty(len(chain)))
@@ -80,7 +80,7 @@ def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> 
 
 
 def _note(recovery: Recovery, lost: str) -> None:
-    """Add a loss, one line, to the findings and mark them as finished; nothing for ''."""
+    """Add a loss, one line, to ``recovery``, and mark it as finished; nothing for ''."""
     if lost:
         recovery.finished = True
         recovery.lost.append(lost)

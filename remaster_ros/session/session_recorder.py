@@ -156,7 +156,7 @@ def session_header(cell: Workcell, settle_s: float) -> Session:
 
 
 class Keeper(Protocol):
-    """Writes the session; failed writes are repeated later."""
+    """Writer of a recorder's session: a write for which the disk has no room is repeated later."""
 
     journal: SessionJournal
     # Why nothing can be written now; ''.
@@ -176,26 +176,26 @@ class Outlet:
     """Receives the results of recording; this one ignores them, that of a node publishes them."""
 
     def event(self, event: events.Event) -> None:
-        """Publish an event of this recorder."""
+        """Publish an event of this recorder; this base class does nothing."""
 
     def state(self) -> None:
         """Publish the recorder's state, which has changed."""
 
     def registered(self, sensor: str, T_R_N: FloatArray) -> None:
-        """Publish a registration, T_R_N (4, 4)."""
+        """Publish a sensor's registration: pose of its frame N in the robot base R, (4, 4)."""
 
     def measure(self) -> None:
         """Request measurements from single-shot sensors: a reading has begun."""
 
     def ended_by_hand(self, ended: EndedReading) -> None:
-        """Answer a registration by hand with its reading."""
+        """Answer the request for a registration by hand with its reading, which has ended."""
 
     def log(self, level: int, text: str) -> None:
         """Log a line; `level` as in `logging`."""
 
 
 class SessionRecorder:
-    """Recorder of a session; see the module.
+    """Makes a session of messages and event records, without ROS itself; see the module.
 
     Parameters
     ----------
@@ -215,8 +215,8 @@ class SessionRecorder:
     required
         Sensors that the arm waits for.
     counts, not_finite, waited_s
-        Outcomes of readings and configurations; readings with non-finite numbers, and time the arm
-        stood still, s, per sensor.
+        Outcomes of readings and configurations; readings with non-finite numbers, and time the
+        arm stood still, s, per sensor.
     trouble
         What is wrong with the last message; ''.
     run
@@ -253,7 +253,8 @@ class SessionRecorder:
     def _begin(self) -> None:
         """Restore the state from the session on the disk, as a recorder does when it starts.
 
-        Readings under way, registrations and changes are made anew.
+        Readings under way are dropped; registrations and changes are restored from the
+        journal.
         """
         cell, p = self.cell, self._p
         markers = {name: np.array(position) for name, position in cell.markers.items()}
@@ -280,12 +281,15 @@ class SessionRecorder:
         self._restore_measurements()
 
     def _restore_measurements(self) -> None:
-        """Restore registrations and reference measurements from the session."""
+        """Restore registrations and reference measurements from the session's journal."""
         self._register(self.journal.registration)
         self.changes.take_back(self.journal.watched, self.registration.T_R_N)
 
     def _positions(self, message: Any) -> FloatArray | None:
-        """Return positions of the cell's joints, rad or m, (k,); None if invalid (`trouble`)."""
+        """Return positions of the cell's joints in a JointState, rad or m, (k,).
+
+        None if the message is invalid, with the reason in `trouble`.
+        """
         try:
             return self._order.positions(message)
         except InputError as error:
@@ -295,8 +299,8 @@ class SessionRecorder:
     def take_joints(self, message: Any) -> None:
         """Take a sensor_msgs/JointState of the robot; those of a gripper are ignored.
 
-        An invalid one is dropped and sets `trouble`, a valid one clears it; a decided reading is
-        ended.
+        An invalid one is dropped and sets `trouble`. A valid one clears it; if the outcome of
+        the reading under way is now decided, that is ended and written.
         """
         if self._order.concerns(message) and (q := self._positions(message)) is not None:
             self.trouble = ''
@@ -316,9 +320,11 @@ class SessionRecorder:
         self.recording.take_solutions(stamp_key(message.header.stamp), solutions)
 
     def take_settled(self, message: Any) -> None:
-        """Take a sensor_msgs/JointState of a settled arm; the next reading begins if one is due.
+        """Take a sensor_msgs/JointState of a settled arm; begin to read the configuration.
 
-        At no solution of the announced pose it is counted as 'settled_unknown' and sets `trouble`.
+        It waits if a reading is under way. An arm at no solution of the announced pose is
+        counted as 'settled_unknown' and sets `trouble`, as an invalid message does, which is
+        dropped.
         """
         if (q := self._positions(message)) is None:
             return
@@ -369,8 +375,9 @@ class SessionRecorder:
     def take_record(self, record: events.EventRecord) -> None:
         """Update the state by an event record of another node, or of the recorder of a bag.
 
-        Poses, failed solutions, planner and bridge states and stops of the arm always; outcomes
-        and readings by hand only from a bag. Other records are ignored.
+        Always: poses, failed solutions, states of planner and bridge, stops of the arm, and a
+        recorder's start (of a bag). Only from a bag: outcomes and readings by hand. Other
+        records are ignored.
         """
         match record.body:
             case events.PoseAnnounced() as pose:
@@ -397,10 +404,11 @@ class SessionRecorder:
                 self.recording.begin_by_hand(read.stamp_s, np.array(read.q))
 
     def _on_began(self, began: events.RecorderBegan) -> None:
-        """Restart as the recorder of a bag did, with the state of its session at that time.
+        """Process the start of a recorder: restart as that of the bag did.
 
-        The first start of a bag opens nothing; a later one closes the session as stopped and
-        reopens it. Nothing is done if the recorder only continued.
+        The first start in a bag opens nothing; a later one closes the session as stopped and
+        reopens it. The state is then that of the session. A start that only continued changes
+        nothing.
         """
         first, self.from_bag = not self.from_bag, True
         if began.continued:
@@ -411,14 +419,15 @@ class SessionRecorder:
         self._begin()
 
     def _end_as_recorded(self, result: str, reason: str) -> None:
-        """Decide the reading under way as the bag's recorder did: its result and reason."""
+        """End the reading under way with the result and the reason of the bag's recorder."""
         self.recording.end_as_recorded(result, reason)
         self.end_reading()
 
     def _on_pose(self, pose: events.PoseAnnounced) -> None:
         """Set the announced pose, and record which of its solutions are unreachable.
 
-        A pose after the references ends their round: changes of the setup are reported.
+        A pose that is neither a reference nor of a registration ends a round of the
+        references: a new change of the set-up is reported.
         """
         self.recording.announced = pose
         self._failed = [failed for failed in self._failed if failed.stamp == pose.stamp]
@@ -427,10 +436,10 @@ class SessionRecorder:
         self._record_unreached()
 
     def _on_planner(self, planner: events.PlannerState) -> None:
-        """Follow the planner's state, while no reading is under way.
+        """Process the planner's state: its run, and a change that a person has accepted.
 
-        The session is closed when the planner completes or stops, and reopened when it resumes or
-        adds measurements.
+        While no reading is under way and the disk has room, the session is closed when the
+        planner completes or stops, and reopened when it resumes or adds measurements.
         """
         self.run = planner.run_held(self.run)
         accepted = self.changes.follow(planner.state, self.run)
@@ -448,9 +457,9 @@ class SessionRecorder:
             self.keeper.write(self._go_further)
 
     def _go_further(self) -> None:
-        """Reopen the complete session for measurements that separate causes.
+        """Reopen the complete session for measurements that separate causes of error.
 
-        An InputError sets `trouble`. The state is published.
+        An InputError of that sets `trouble`. The state is published in any case.
         """
         try:
             self.keeper.reopen(go_further=True)
@@ -480,7 +489,10 @@ class SessionRecorder:
         )
 
     def look(self) -> None:
-        """End a decided reading, begin the next, record unreachable solutions; call often."""
+        """End a reading that is decided by now, and begin the next one; to be called often.
+
+        Unreachable solutions are recorded, too.
+        """
         self.end_reading()
         self.recording.look_again()
         self.take_next()
@@ -489,7 +501,8 @@ class SessionRecorder:
     def _record_unreached(self) -> None:
         """Record the plan of the announced pose, and its solutions without a path or that failed.
 
-        Each once; nothing without an announced pose, if the session is closed or the disk full.
+        Each solution once. Nothing is recorded without an announced pose, if the session is
+        closed, or while the disk is full.
         """
         pose = self.recording.announced
         if pose is None or self.journal.closed or self.keeper.full:
@@ -515,10 +528,10 @@ class SessionRecorder:
                 self._outlet.state()
 
     def take_next(self) -> None:
-        """Begin the next reading, unless one is under way or being written.
+        """Begin to read the next settled configuration, unless a reading is under way.
 
-        A configuration with an outcome is reported, not read again; one of another plan or
-        correction is skipped, with `trouble`.
+        Nothing happens either while the disk is full. A configuration with an outcome is
+        reported, not read again; one of another plan or correction is skipped, with `trouble`.
         """
         while not self.keeper.full and (settled := self.recording.next()) is not None:
             pose = settled.pose
@@ -540,7 +553,7 @@ class SessionRecorder:
     def read_by_hand(self) -> None:
         """Begin a reading at the arm's present position, for a registration by hand.
 
-        A joint state has to have come before.
+        Requires that a joint state has come (AssertionError otherwise).
         """
         q, now_s = self.recording.q, self.recording.now_s
         assert q is not None
@@ -554,9 +567,9 @@ class SessionRecorder:
         return self.required.are_among(self.registration.T_R_N)
 
     def end_reading(self) -> None:
-        """Count and write the outcome of the reading under way, once it is decided.
+        """Count and write the outcome of the reading under way, if it is decided by now.
 
-        Nothing before that. Waiting times, refused, accepted and dropped frames are counted.
+        Else nothing happens. Waiting times, refused, accepted and dropped frames are counted.
         """
         ended = self.recording.end(self.registration.T_R_N)
         if ended is None:
@@ -572,9 +585,12 @@ class SessionRecorder:
         self.keeper.write(partial(self._write_outcome, ended))
 
     def _write_outcome(self, ended: EndedReading) -> None:
-        """Write the outcome of a configuration, publish it, and take the next configuration.
+        """Write the outcome of a configuration, publish it, and begin the next reading.
 
-        A rejected configuration of a pose that is no longer announced is published, not written.
+        Registers sensors by a registration pose, and looks for changes at a reference. A
+        rejected configuration of a pose that is no longer announced is published only. A
+        reading by hand is written and answered, without an event. Neither begins the next
+        reading.
         """
         settled, pose = ended.settled, ended.settled.pose
         if ended.result == 'rejected' and pose not in (self.recording.pose, BY_HAND):
@@ -608,9 +624,9 @@ class SessionRecorder:
         self.take_next()
 
     def _register(self, readings: Sequence[PairedReading]) -> None:
-        """Add readings of registration poses; publish completed registrations, log troubles.
+        """Add readings of registration poses, and publish the registrations that they complete.
 
-        Troubles are logged as warnings, of the sensors of these readings alone.
+        Troubles of the sensors of these readings are logged as warnings.
         """
         for name in self.registration.add(readings):
             self._outlet.registered(name, self.registration.T_R_N[name])
@@ -626,7 +642,10 @@ class SessionRecorder:
         self._outlet.state()
 
     def _report_change(self, new: bool) -> None:
-        """Log and publish a change at the references if it is new; the planner pauses by it."""
+        """Log and publish the change found at the references; the planner pauses by it.
+
+        Nothing happens unless ``new``, or if the changes have nothing to report.
+        """
         event = self.changes.report(self.run) if new else None
         if event is not None:
             self._outlet.log(logging.ERROR, event.text)

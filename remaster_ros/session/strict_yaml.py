@@ -26,7 +26,7 @@ _CORE_RESOLVERS = (
 
 
 class YamlError(ValueError):
-    """Text that is not YAML of this subset; ``str()`` is one line with the place."""
+    """Text that is not YAML as read here; ``str()`` is one line with the place in the text."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -60,7 +60,7 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that YAML 1.1 or 1.2 would not read as text."""
+    """Dumper that quotes text which YAML 1.1 or 1.2 would not read as text."""
 
 
 for _name, _pattern, _first in _CORE_RESOLVERS:

@@ -53,16 +53,20 @@ def key_lines(text: str) -> dict[Keys, int]:
 
 
 def with_line(text: str, problem: str) -> str:
-    """Return a problem that begins with a dotted key, with 'line N: ' if the key is found."""
+    """Return the message of a problem with 'line N: ' in front, if its key is in the YAML text.
+
+    ``problem``: message that begins with the dotted key.
+    """
     key = problem.split(maxsplit=1)[0].rstrip(':')
     line = key_lines(text).get(tuple(key.split('.')))
     return f'line {line}: {problem}' if line else problem
 
 
 def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
-    """Return a message of msgspec with the line of the key, and a similar known key.
+    """Return a validation message of msgspec with the line and path of the key in the file.
 
-    ``text``: of the file; ``record``: its type.
+    For an unknown key with a similar known one, or all known ones. ``text``: of the file;
+    ``record``: its type. Unchanged if the place is not found.
     """
     match = _AT.search(message)
     steps = re.findall(r'\w+|\[[^\]]*\]', match[1]) if match else []
@@ -88,9 +92,10 @@ def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
 
 
 def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: Keys) -> bool:
-    """Return whether a file with only the entry at this path would be refused as the record.
+    """Return whether the entry at a path of a YAML text breaks the record type.
 
-    ``steps``: place in msgspec's message, with [...] for unknown keys, as long as ``path``.
+    Tried with the file's other entries of the same dictionaries left out. ``steps``: place in
+    msgspec's message, with [...] for keys of dictionaries; ``path``: keys, as many.
     """
     content = load_yaml(text)
     here = content
@@ -107,9 +112,9 @@ def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: K
 
 
 def _fields(record: type[msgspec.Struct], steps: list[str]) -> list[str]:
-    """Return the keys of a nested record at some steps (keys) into a record type.
+    """Return the known keys of a record that is nested in a record type.
 
-    [] if there is no record.
+    ``steps``: keys that lead to it. [] if there is no record.
     """
     kind: Any = msgspec.inspect.type_info(record)
     for step in steps:
@@ -137,9 +142,9 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(content: Any, record: Any) -> Any:
-    """Return a `record` (a type) from the plain data of `to_plain`, with arrays of floats.
+    """Return an object of the type `record` from plain data, as `to_plain` returns it.
 
-    Raises ValueError, which names the place of an error.
+    Arrays become arrays of floats. Raises ValueError, which names the place of an error.
     """
     return msgspec.convert(content, record, dec_hook=lambda _, values: np.array(values, float))
 
@@ -163,14 +168,15 @@ def read_yaml(data: bytes, path: Path, record: type[Record], remedy: str = '') -
 
 @cache
 def _hints(record: type) -> dict[str, Any]:
-    """Return the annotations of a record by field, with the bounds in them."""
+    """Return the annotation of each field of a record type, with the bounds in it."""
     return get_type_hints(record, include_extras=True)
 
 
 def out_of_bounds(value: Any, key: str = '', bounds: Bounds = FINITE) -> str:
-    """Return what is wrong with the first number outside its bounds; '' if none is.
+    """Return the error of the first number that is outside its bounds; '' if none is.
 
-    ``value``: a record or a part of one; ``key``: its dotted key; ``bounds``: of its field.
+    ``value``: a record or a part of one; ``key``: its dotted key, '' for a whole record;
+    ``bounds``: those of its field.
     """
     if isinstance(value, float):
         return bounds.problem(key, value)

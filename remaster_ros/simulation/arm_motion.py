@@ -27,7 +27,7 @@ _DAMPED = NATURAL_FREQUENCY * np.sqrt(1 - DAMPING * DAMPING)
 
 @dataclass(frozen=True)
 class ServoPoint:
-    """Point of a trajectory: time from the start (s), position (rad) and velocity (rad/s).
+    """Point of a trajectory: time from its start (s), position (rad) and velocity (rad/s).
 
     Without a velocity the controller interpolates linearly towards the point, as the real one
     does.
@@ -45,10 +45,11 @@ def spline(
     end_velocity: FloatArray | None,
     duration: float,
 ) -> FloatArray:
-    """Coefficients, lowest power first, (2 or 4, k), of the piece between two waypoints.
+    """Polynomial coefficients between two waypoints, lowest power first, (2 or 4, k).
 
-    In s from its start. Cubic (Hermite) if the end has a velocity, else linear, whatever the
-    velocity at the start. `duration`: s, above 0.
+    Of the positions over time in s from the first waypoint. Cubic (Hermite) if
+    ``end_velocity`` is given, else linear, whatever the velocity at the start. `duration`: s,
+    above 0.
     """
     T, gap = duration, end - start
     if end_velocity is None:
@@ -61,12 +62,13 @@ def spline(
 def from_now(
     now_s: float, begins_s: float | None, points: Sequence[ServoPoint]
 ) -> tuple[list[ServoPoint], tuple[FloatArray, FloatArray] | None]:
-    """Remaining part of a trajectory with a stamp, and its reference now (position, velocity).
+    """Remaining points of a trajectory, and its reference (position, velocity) now, or None.
 
-    As in joint_trajectory_controller, points whose time has passed are dropped, and the reference
-    is between the two points around now. The reference is None, for the arm's own position, if no
-    point has passed or all have; then no point remains. ``begins_s``: the stamp, s, None for now;
-    ``points``: at times from the stamp; the remaining ones are at times from now.
+    As in joint_trajectory_controller, points whose time has passed are dropped, and the
+    reference is between the last passed and the first remaining point. None, which means to
+    begin at the arm's own position, if no point has passed, or all have (then no point
+    remains). ``begins_s``: stamp of the trajectory, s, None for now; ``points``: at times from
+    the stamp; the remaining ones are at times from ``now_s``.
     """
     since_s = 0.0 if begins_s is None else now_s - begins_s
     remaining = [
@@ -89,7 +91,7 @@ def from_now(
 def _steady_response(reference: FloatArray) -> FloatArray:
     """Polynomial particular solution of the servo equation for a polynomial reference.
 
-    Coefficients, lowest power first, (powers, k), as those of the reference.
+    Coefficients over time in s, lowest power first, (powers, k), as those of ``reference``.
     """
     w, z = NATURAL_FREQUENCY, DAMPING
     out = np.zeros_like(reference)
@@ -105,7 +107,10 @@ def _steady_response(reference: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Response:
-    """x(s) = polynomial(s) + e^(-ζωs) (a cos ω_d s + b sin ω_d s) for s = t - start >= 0."""
+    """Position of the servo from ``start_s`` on: polynomial and decaying oscillation.
+
+    x(s) = polynomial(s) + e^(-ζωs) (a cos ω_d s + b sin ω_d s) for s = t - start_s >= 0.
+    """
 
     start_s: float
     polynomial: FloatArray
@@ -114,9 +119,9 @@ class _Response:
 
     @classmethod
     def of(cls, start_s: float, reference: FloatArray, x: FloatArray, v: FloatArray) -> _Response:
-        """Response to a polynomial reference (powers, k) from positions x and speeds v.
+        """Response to a polynomial reference (powers, k) from positions x and velocities v, (k,).
 
-        All at `start_s`.
+        All at ``start_s``, from which the polynomial's time counts.
         """
         steady = _steady_response(reference)
         a = x - steady[0]
@@ -155,11 +160,12 @@ class Motion:
         waypoints: Sequence[ServoPoint],
         reference_now: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        """Follow a trajectory from `start_s` on, in the place of the present one.
+        """Follow a trajectory from ``start_s`` on, in place of the rest of the last one.
 
-        ``waypoints``: at times from `start_s`, which increase; the last one is held.
-        ``reference_now``: position and velocity of the trajectory at `start_s`, (k,) each; None if
-        it begins at the arm's position. Of the motion before it the last 16 pieces are kept.
+        ``waypoints``: at increasing times from ``start_s``, above 0; the last position is
+        held. ``reference_now``: position and velocity of the trajectory at ``start_s``, (k,)
+        each; None if it begins at the arm's own. Of the motion before, the last 16 pieces are
+        kept.
         """
         # A later trajectory replaces the future of the former one.
         past = [r for r in self._responses if r.start_s <= start_s] or self._responses[:1]
@@ -180,7 +186,7 @@ class Motion:
         self._responses.append(_Response.of(start_s + begin_s, reference[None], x, v))
 
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad) and velocities (rad/s) at world time t, each (k,).
+        """Joint positions (rad) and velocities (rad/s) at world time t, s, (k,) each.
 
         Before the oldest kept piece: those at its beginning.
         """

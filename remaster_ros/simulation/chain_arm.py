@@ -23,14 +23,17 @@ SECONDS_PER_CONFIGURATION = 10.0
 
 
 class ChainArm:
-    """`Arm` of a `SerialChain`."""
+    """Kinematics and gravity of an arm as drawn, computed from its serial chain (see `Arm`)."""
 
     def __init__(self, chain: SerialChain) -> None:
         self._chain = chain
         self.joints, self.slides = len(chain), chain.slides
 
     def state(self, q: FloatArray) -> ArmState:
-        """State of every joint for true joint positions q, rad or m, (n, k)."""
+        """Origins, frames and axes of all joints, and the tool, at true positions q (n, k).
+
+        In the robot base frame R. ``q``: rad or m.
+        """
         chain = self._chain
         frames = chain.frames(q)
         tool = frames[:, -1] @ chain.T_fixed[-1]
@@ -51,18 +54,25 @@ class ChainArm:
     def gravity_torque(self, q: FloatArray) -> FloatArray:
         """Gravity's torque about each joint, in its positive direction, N m, (n, k).
 
-        The force along it, N, for a joint that slides.
+        The force along it, N, for a joint that slides. ``q``: true positions, rad or m, (n,
+        k).
         """
         return self._chain.gravity_torque(q, GRAVITY)
 
     def base_moment(self, q: FloatArray) -> FloatArray:
-        """Moment of the moving links' weight about the base's origin, in R, N m, (n, 3)."""
+        """Torque of the moving links' weight about the origin of the base, N m, (n, 3).
+
+        In the robot base frame R. ``q``: true positions, rad or m, (n, k).
+        """
         centers = apply(self._chain.frames(q), self._chain.centers_of_mass)
         moment = np.sum(self._chain.masses[:, None] * centers, axis=1)
         return np.cross(moment, np.array(GRAVITY))
 
     def carried_moment(self, q: FloatArray) -> FloatArray:
-        """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
+        """Gravity's torque on all links behind each joint about its origin, N m, (n, k, 3).
+
+        In the robot base frame R. ``q``: true positions, rad or m, (n, k).
+        """
         chain = self._chain
         frames = chain.frames(q)
         centers = apply(frames, chain.centers_of_mass)
@@ -74,18 +84,19 @@ class ChainArm:
         return moments
 
     def segments(self) -> FloatArray:
-        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3).
+        """Vectors from the base to joint 1, from joint to joint, and to the tool, m, (k + 1, 3).
 
-        Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
+        As drawn. Row j is in the frame after joint j, row 0 in that of the base.
         """
         return self._chain.T_fixed[:, :3, 3]
 
 
 def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: str) -> FloatArray:
-    """True positions of a marker at the stops of a tour, in the base's frame R, m, (m, 3).
+    """True positions of a marker at the configurations of a tour, in the base frame R, m, (m, 3).
 
     ``chain``: the arm as drawn; ``truth``: its deviations; ``q``: reported joint angles in the
-    order of the tour, rad, (m, k); ``marker``: name of the marker.
+    order of the tour, rad, (m, k); ``marker``: name of the marker. Raises KeyError for an
+    unknown one.
     """
     tour = model_of_tour(chain, truth, q)
     names = tuple(truth.sensors), tuple(truth.markers)
@@ -95,9 +106,10 @@ def tool_points(chain: SerialChain, truth: SessionTruth, q: FloatArray, marker: 
 
 
 def model_of_tour(chain: SerialChain, truth: SessionTruth, q: FloatArray) -> WorldModel:
-    """True arm on a tour through the configurations q, rad or m, (m, k), in that order.
+    """Model of the true arm and sensors on a tour through reported configurations, in this order.
 
-    It begins at the first one; a configuration takes 10 s (`SECONDS_PER_CONFIGURATION`).
+    ``q``: rad or m, (m, k). The tour begins at the first one; each takes 10 s
+    (`SECONDS_PER_CONFIGURATION`). Effects of ``truth`` are not in the model.
     """
     time_s = SECONDS_PER_CONFIGURATION * np.arange(len(q), dtype=float)
     visited = Round(q, q[0], time_s, truth.warming.at(truth.warming.start_s + time_s))

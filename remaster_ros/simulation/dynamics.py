@@ -43,7 +43,7 @@ EXPOSURE_S, LATENCY_S, LARGEST_DRIFT = (1e-3, 5e-3), (3e-3, 20e-3), 5e-5
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """Times of a camera's frames."""
+    """Exposure, latency and clock drift of a camera's frames."""
 
     exposure_s: float  # A frame shows its middle, and is stamped with its beginning
     latency_s: float  # From the beginning of the exposure until the frame is sent
@@ -51,13 +51,13 @@ class CameraTiming:
 
     @property
     def late_s(self) -> float:
-        """Time from what a frame shows until the frame is sent, s."""
+        """Time from what a frame shows, the middle of its exposure, until it is sent, s."""
         return self.latency_s - 0.5 * self.exposure_s
 
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """Hidden dynamics of an arm with k joints."""
+    """Motion that encoders do not see: lag, friction, elasticity, a mode; timing of cameras."""
 
     lag_s: FloatArray  # Delay of each joint's reported position, s, (k,)
     windup_rad: FloatArray  # Largest wind-up by friction, rad or m, (k,)
@@ -72,7 +72,11 @@ class Dynamics:
     def drawn(
         cls, chain: SerialChain, sensors: tuple[str, ...], scale: float, rng: np.random.Generator
     ) -> Dynamics:
-        """Random dynamics; ``scale``: of the arm's, 1 for sizes of real machines."""
+        """Random dynamics of an arm, with random timing of a camera for each sensor.
+
+        ``scale``: factor on lags, wind-up and softness, 1 for sizes of real machines; the
+        mode's frequency falls with its root. Camera timing does not depend on it.
+        """
         k = len(chain)
         cameras = {
             name: CameraTiming(
@@ -97,10 +101,10 @@ class Dynamics:
 
 
 class LinkSide:
-    """Difference between the links' side of a moving arm and its encoders.
+    """Difference between the links of a moving arm and its encoders, over time.
 
-    ``offsets``: true joint angle minus reported one, rad or m, (k,); ``start_s``: time at which
-    the arm stands, s.
+    ``offsets``: true joint angle minus reported one, rad or m, (k,); ``start_s``: time at
+    which the arm stands, s.
     """
 
     def __init__(
@@ -115,7 +119,10 @@ class LinkSide:
         self._states: deque[tuple[float, FloatArray, FloatArray]] = deque([still])
 
     def advance(self, motion: Motion, until_s: float) -> None:
-        """Follow a motion to a time, s; nothing if that is past already."""
+        """Compute the difference along a motion, in steps of `STEP_S`, up to a world time, s.
+
+        Nothing if that time has been reached already.
+        """
         count = int(np.ceil((until_s - self._done_s) / STEP_S - 1e-9))
         if count <= 0:
             return
@@ -145,10 +152,11 @@ class LinkSide:
             self._states.popleft()
 
     def at(self, motion: Motion, t: float) -> tuple[FloatArray, FloatArray]:
-        """Added joint angles, rad or m, (k,), and shift of the tool in R, m, (3,), at a time, s.
+        """Added joint angles, rad or m, (k,), and shift of the tool, m, (3,), at world time t, s.
 
-        Interpolated between steps; the motion is followed up to this time first. Of times over a
-        second ago: the oldest kept ones.
+        The shift is in the robot base frame R. Interpolated between steps; the motion is
+        followed up to this time first. For times before the oldest kept step: the values
+        there.
         """
         self.advance(motion, t)
         after = next((i for i, state in enumerate(self._states) if state[0] >= t), -1)
@@ -161,7 +169,11 @@ class LinkSide:
 
 
 def _oscillator(hz: float, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Matrix and input of a step of an oscillator under a steady acceleration, (2, 2), (2,)."""
+    """Matrices A (2, 2) and b (2,) of a step `STEP_S` of a damped oscillator: x becomes A x + b u.
+
+    x: deflection and speed; u: acceleration, constant during the step. ``hz``: natural
+    frequency; zeros if it is infinite.
+    """
     if not np.isfinite(hz):
         return np.zeros((2, 2)), np.zeros(2)
     w = 2.0 * np.pi * hz
@@ -171,15 +183,16 @@ def _oscillator(hz: float, damping: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _second_difference(values: FloatArray) -> FloatArray:
-    """Second derivative of values (n + 2, ...) in steps of `STEP_S`, (n, ...)."""
+    """Second time derivative, (n, ...), of n + 2 values in steps of `STEP_S`, at the inner n."""
     found: FloatArray = (values[2:] - 2.0 * values[1:-1] + values[:-2]) / STEP_S**2
     return found
 
 
 def _inertial_torque(chain: SerialChain, frames: FloatArray) -> FloatArray:
-    """Torque of the masses' inertia about each joint, or force along it, (n, k), of n + 2 frames.
+    """Torque of the links' inertia about each joint, N m, or force along it, N, (n, k).
 
-    Each link's mass is at its centre.
+    At the inner n of n + 2 ``frames`` of the joints in the robot base frame R, (n + 2, k, 4,
+    4), `STEP_S` apart. The mass of each link is at its centre.
     """
     centers = apply(frames, chain.centers_of_mass)
     force = -chain.masses[:, None] * _second_difference(centers)

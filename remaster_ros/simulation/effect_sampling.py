@@ -23,7 +23,7 @@ TRIES = 30
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """Request for a hidden effect."""
+    """Request for a hidden effect: its kind, and its joint and size if they are to be fixed."""
 
     kind: str  # Key of `KINDS`, or ``random`` for any kind with a name
     joint: int | None = None  # Number of the joint with the error, from 1; None for any joint
@@ -31,10 +31,10 @@ class EffectSpec:
 
     @classmethod
     def parse(cls, text: str) -> EffectSpec:
-        """Request from ``NAME[@JOINT][:SIZE_MM]``: ``backlash``, ``backlash@4:0.3``, ``random``.
+        """Read a request ``NAME[@JOINT][:SIZE_MM]``: ``backlash``, ``backlash@4:0.3``, ``random``.
 
-        Joints count from 1. Raises InputError if the text has another form, the name is unknown,
-        or joint or size is 0.
+        Joints count from 1. Raises InputError if the text has another form, the name is
+        unknown, or joint or size is 0.
         """
         match = re.fullmatch(r'([a-z_]+)(?:@(\d+))?(?::(\d*\.?\d+))?', text)
         if match is None or match[1] not in (RANDOM, *KINDS):
@@ -52,11 +52,11 @@ class EffectSpec:
 def hide(
     stage: WorldModel, requests: Sequence[EffectSpec], rng: np.random.Generator
 ) -> tuple[HiddenEffect, ...]:
-    """Random effects for the requests, in their order.
+    """Draw a random effect for each request, in this order.
 
-    Sizes that are not requested are 0.2 to 0.6 mm, of a marker's offset 2 to 6 mm. Raises
-    InputError if an effect cannot be seen with this arm on these visits, or is at a joint that the
-    arm does not have.
+    ``stage``: arm, sensors and visits on which the sizes are measured. Sizes that are not
+    requested are 0.2 to 0.6 mm, of a marker's offset 2 to 6 mm. Raises InputError if an effect
+    cannot be seen with this arm on these visits, or is at a joint that the arm does not have.
     """
     effects = []
     for request in requests:
@@ -81,9 +81,9 @@ def with_effects(
     requests: Sequence[EffectSpec],
     rng: np.random.Generator,
 ) -> SessionTruth:
-    """Copy of the truth with the effects of the requests, as `hide` draws them, and their sizes.
+    """Return a copy of the truth with effects for the requests, drawn by `hide`, and their sizes.
 
-    Raises InputError as `hide`.
+    They replace the truth's effects. Raises InputError as `hide`.
     """
     effects = hide(stage, requests, rng)
     sizes_m = tuple(stage.size_m(effect) for effect in effects)
@@ -93,13 +93,14 @@ def with_effects(
 def draw_effect(
     stage: WorldModel, kind: str, rng: np.random.Generator, size_m: float, joint: int | None = None
 ) -> HiddenEffect:
-    """Random effect of a kind, with the size `size_m` (see `WorldModel.size_m`).
+    """Draw a random effect of a kind, with the size `size_m` (see `WorldModel.size_m`).
 
-    ``joint``: number of the joint, from 1; None for any. An effect that would have to be larger
-    than plausible is drawn again, up to 30 times (for a joint 30 times its arm's joints): a joint
-    that hardly moves shows no eccentricity. If no draw is plausible, the most visible draw is
-    used. Raises InputError if all draws leave nothing (under 1 µm), if none concerns the joint, or
-    if those of the joint would have to be larger than plausible.
+    ``joint``: number of the joint, from 1; None for any. An effect that would have to be
+    larger than plausible is drawn again, up to 30 times (for a joint 30 times its arm's
+    joints): a joint that hardly moves shows no eccentricity. If no draw is plausible and no
+    joint is given, the most visible draw is used. Raises InputError if all draws leave nothing
+    (under 1 µm), if none concerns the joint, if those of the joint would have to be larger
+    than plausible, or if an effect of slides is asked of an arm without them.
     """
     drawn_from = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
@@ -139,9 +140,10 @@ def draw_effect(
 
 
 def _balanced(stage: WorldModel, effect: HiddenEffect) -> HiddenEffect:
-    """Effect whose joints each leave as much as their drawn value, the largest one as drawn.
+    """Return an effect of several joints with values such that all joints have the same relation.
 
-    Otherwise one of two compliant joints could have no visible part in the effect.
+    Of the size that a joint's part leaves after the fit to its drawn value; the largest value
+    stays as drawn. Otherwise one of two compliant joints could have no visible part.
     """
     sizes = [
         stage.size_m(replace(effect, joints=(joint,), values=np.ones(1)))

@@ -18,7 +18,7 @@ Cause = tuple[str, tuple[int, ...], str]
 
 
 def causes(effect: HiddenEffect) -> list[Cause]:
-    """Causes that discovery has to name: one for each compliant joint, else one.
+    """Causes that discovery has to report for a hidden effect: one per compliant joint, else one.
 
     Joints count from 1; a coupled joint is followed by the one that drives it.
     """
@@ -32,7 +32,10 @@ def causes(effect: HiddenEffect) -> list[Cause]:
 
 
 def _without_name(effect: HiddenEffect) -> Cause:
-    """Cause of an effect without a name: joints, with the one that is followed, place, driver."""
+    """Cause 'unnamed' that discovery has to report for an effect of an unnamed kind.
+
+    With the joints, that of the driver last if it is another, and 'PLACE DRIVER'.
+    """
     cell = KINDS[effect.kind]
     joints, driver = effect.joints, cell.driver
     if 'by' in effect.detail:
@@ -42,10 +45,10 @@ def _without_name(effect: HiddenEffect) -> Cause:
 
 
 def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
-    """Causes in an entry of the list ``effects`` of a discovery.json, one for each joint.
+    """Causes in one entry of the list ``effects`` of a discovery.json, one for each joint.
 
-    One for all joints of a coupling or of an effect without a name. Only a sensor's effect has the
-    name of the sensor, else ''.
+    One for all joints of a coupling or of an effect without a name. The third part is 'PLACE
+    DRIVER' of an effect without a name, the sensor's name of a sensor's effect, else ''.
     """
     name, joints = effect['name'], tuple(effect['joints'])
     if name not in NAMED:
@@ -60,10 +63,10 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
 
 
 def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
-    """Whether a found cause is the hidden one, which is a cause of the effect.
+    """Whether a found cause is a right answer to a hidden one, which is a cause of ``effect``.
 
-    The joints must be equal in order. An effect without a name is found by any cause with the same
-    place and driver, or with a name that its kind accepts.
+    The joints must be equal, in order. A hidden effect without a name is found by any cause of
+    no name with the same place and driver, or by a name that its kind accepts.
     """
     name, joints, detail = found
     if joints != hidden[1]:
@@ -76,7 +79,7 @@ def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
 
 
 def describe(cause: Cause) -> str:
-    """Cause in a few words: name, joints if any, sensor or place and driver if any."""
+    """Describe a cause as text: name, joints if any, then sensor or place and driver if any."""
     name, joints, detail = cause
     where = f'joint {", ".join(map(str, joints))}' if joints else ''
     return ' '.join(part for part in (name, where, detail) if part)

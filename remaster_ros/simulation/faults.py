@@ -78,10 +78,10 @@ OF_TRACKER = {
 
 
 def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
-    """Write the faults of the World in `folder`, in place of the former ones; empty ends all.
+    """Write the faults of the World in `folder`, in place of all former ones; {} ends all.
 
-    ``faults``: device -> fault -> its number. Raises InputError for a fault that the device has
-    not.
+    ``faults``: device ('robot' or a sensor) -> fault -> its number. Raises InputError for a
+    fault that such a device cannot have; then nothing is written.
     """
     for device, numbers in faults.items():
         known = OF_ROBOT if device == 'robot' else OF_OPTITRACK | OF_TRACKER
@@ -97,7 +97,7 @@ def inject(folder: Path, faults: Mapping[str, Numbers]) -> None:
 
 
 class Faults:
-    """Present faults of a World."""
+    """Present faults of the devices of a World, read from the file that `inject` writes."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / FILE
@@ -119,7 +119,7 @@ class Faults:
 
 
 def in_outage(period_s: float | None, t: float) -> bool:
-    """Whether a device that fails every other period fails at time t, s.
+    """Whether a device that fails in every second period of ``period_s`` fails at time t, s.
 
     It works in the first period, from 0 on. Never with a period of None or 0.
     """

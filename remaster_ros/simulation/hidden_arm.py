@@ -27,9 +27,9 @@ MOVES_KEPT = 16
 
 
 class TrueArm:
-    """True arm in front of the true sensors.
+    """Deviations of the true arm and sensors over time, and noise-free readings.
 
-    ``chain``: the arm as drawn; ``truth``: its deviations; ``start_s, q``: time and joint
+    ``chain``: the arm as drawn; ``truth``: its deviations; ``start_s, q``: time, s, and joint
     positions at the beginning, rad, (k,).
     """
 
@@ -46,9 +46,9 @@ class TrueArm:
         ]
 
     def move(self, start_s: float, start: FloatArray, end_s: float, end: FloatArray) -> None:
-        """Add a motion from `start` to `end` (reported, rad or m, (k,)), between two times, s.
+        """Add a motion from ``start`` to ``end``, reported positions, rad or m, (k,), at times, s.
 
-        It takes the place of the rest of the last one.
+        It takes the place of the rest of the last motion, if that is not yet over.
         """
         before = self.deviation(start_s)
         self._stops[-1] = start
@@ -61,7 +61,7 @@ class TrueArm:
             del self._stops[:-2], self._times[:-2]
 
     def deviation(self, t: float) -> Deviation:
-        """Deviation of arm and sensors at a time, s, one row.
+        """Deviation of arm and sensors at world time t, s, one row (n = 1).
 
         During a motion it passes smoothly from that before to that at its end.
         """
@@ -72,9 +72,10 @@ class TrueArm:
         return before.map(lambda a, b: a + smooth * (b - a), after)
 
     def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
-        """Noise-free reading of a marker in the sensor's frame N, m, (3,), for reported q, (k,).
+        """Noise-free reading of a marker in the frame N of a sensor, m, (3,), at world time t, s.
 
-        `name`: of the sensor; `marker`: '' for the sensor's first; `t`: world time, s.
+        ``name``: of the sensor; ``q``: reported positions, rad or m, (k,); ``marker``: '' for
+        the sensor's first. Raises KeyError for an unknown sensor or marker.
         """
         sensor, wrong = self._truth.sensors[name], self.deviation(t)
         marker = marker or sensor.marker
@@ -82,7 +83,7 @@ class TrueArm:
         return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
 
     def _deviation(self) -> Deviation:
-        """Deviation at the last stop, one row, with the history of all kept stops."""
+        """Deviation at the last stop, one row (n = 1); effects see all kept stops before it."""
         times = np.array(self._times)
         visited = Round(
             q=np.array(self._stops),

@@ -20,7 +20,7 @@ SLIDE_M = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Circumstances:
-    """Quantities that effects may depend on, at n configurations of k joints."""
+    """Quantities on which hidden effects may depend, at n configurations of k joints."""
 
     # Reported joint angles, and the last move of each joint, rad or m, (n, k)
     q: FloatArray
@@ -79,7 +79,10 @@ class Deviation:
         return cls(sensors, markers, *(np.zeros((n, *shape)) for shape in (*shapes, *per_sensor)))
 
     def map(self, change: Callable[..., FloatArray], *operands: Deviation) -> Deviation:
-        """Deviation with a function applied to each array of this one and those of `operands`."""
+        """Return a deviation whose arrays are a function of this one's and the operands' arrays.
+
+        ``change``: called for each array with this one's array first; operands in their order.
+        """
         names = [s.name for s in fields(self) if s.name not in ('sensors', 'markers')]
         changed: dict[str, Any] = {
             name: change(getattr(self, name), *(getattr(other, name) for other in operands))
@@ -88,9 +91,10 @@ class Deviation:
         return replace(self, **changed)
 
     def measured(self, sensor: str, points: FloatArray) -> FloatArray:
-        """Readings of a sensor, by its name, for true points p in its frame N, m, (n, 3).
+        """Readings of a sensor, with its errors, for true points in its frame N, m, (n, 3).
 
-        Raises ValueError for an unknown sensor.
+        ``sensor``: its name; ``points``: m, (n, 3), not changed. Raises ValueError for an
+        unknown sensor.
         """
         s = self.sensors.index(sensor)
         across = points * (1.0, 1.0, 0.0)
@@ -111,7 +115,7 @@ class Deviation:
 
 @dataclass(frozen=True, eq=False)
 class HiddenEffect:
-    """Effect with its size."""
+    """Hidden error of the arm or a sensor: kind, joints, and parameter values."""
 
     kind: str  # Name, a key of `NAMED` or `UNNAMED`
     joints: tuple[int, ...]  # Numbers, from 1, of the joints whose angle, link or axis is wrong
@@ -120,7 +124,7 @@ class HiddenEffect:
     detail: Mapping[str, Any] = field(default_factory=dict)
 
     def scaled(self, factor: float) -> HiddenEffect:
-        """Same effect with all values multiplied by a factor."""
+        """Return the same effect with all values multiplied by a factor."""
         return replace(self, values=factor * self.values)
 
     def __str__(self) -> str:
@@ -133,7 +137,7 @@ class HiddenEffect:
 
 @dataclass(frozen=True, eq=False)
 class DrawContext:
-    """Source of randomness, arm, visits and sensors from which an effect is drawn."""
+    """Random generator, arm, visits and sensors from which a random effect is drawn."""
 
     rng: np.random.Generator
     joints: int
@@ -165,9 +169,10 @@ Draw = Callable[[str, DrawContext], HiddenEffect]
 
 
 def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
-    """Draw of a joint, from `first_joint` (from 1) on, and a sign; the value is ±`largest`.
+    """Return a draw of a random joint, with one value of ±`largest` with a random sign.
 
-    No sign if ``positive``: physics has only the positive one.
+    The joint is one from ``first_joint``, counted from 1, to the last. ``positive``: always
+    +`largest`, if physics has only the positive sign.
     """
     return lambda kind, context: HiddenEffect(
         kind,
@@ -177,14 +182,15 @@ def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> D
 
 
 def no_joint(largest: float) -> Draw:
-    """Draw of an effect of no joint with the value `largest`, without randomness."""
+    """Return a draw of an effect of no joint with the one value `largest`, without randomness."""
     return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
 
 
 def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of a sensor's effect: a form, and `size` values, `largest` times a unit vector.
+    """Return a draw of a random sensor's effect: ``size`` values, `largest` times a unit vector.
 
-    Sensor and form, one of `forms`, are random and in the effect's detail.
+    The effect's detail has the sensor's name, ``sensor``, and ``form``, a random one of
+    ``forms``.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -198,10 +204,10 @@ def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> 
 
 
 def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Draw of an effect of two joints: the joint with the error, and another that it follows.
+    """Return a draw of an effect of two random joints: one with the error, one that drives it.
 
-    The other one is ``by`` in the detail, a random one of `forms` is ``form``: two values for
-    'sin/cos', else one; `largest` times a unit vector.
+    The driving joint, from 1, is ``by`` in the effect's detail, and a random one of ``forms``
+    is ``form`` there. Values: two for 'sin/cos', else one; `largest` times a unit vector.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -214,9 +220,10 @@ def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
 
 
 def at_some_time(draw: Draw) -> Draw:
-    """Draw with a random moment from which the effect is present, ``moment_s`` in the detail.
+    """Return a draw as ``draw``, with a random time from which on the effect is present.
 
-    Uniform over 15 to 85 % of the visits' time.
+    ``moment_s`` in the effect's detail, s from the first visit; uniform over 15 to 85 % of the
+    visits' time.
     """
 
     def timed(kind: str, context: DrawContext) -> HiddenEffect:
@@ -233,7 +240,7 @@ Rule = Callable[[HiddenEffect, Deviation, Circumstances], None]
 
 @dataclass(frozen=True)
 class Part:
-    """Parameter of an effect under its name in discovery."""
+    """Parameter of a hidden effect under the name that a discovery gives it."""
 
     # Name with ``{j}`` for the joint, ``{by}`` for the driving joint, ``{order}`` for the order of
     # a wave, ``{sensor}`` for the sensor
@@ -244,9 +251,10 @@ class Part:
     detail: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, effect: HiddenEffect) -> dict[str, float]:
-        """Name and true value, SI units, for an effect of one joint and one order.
+        """Name and true value, SI units, of the parameter in an effect of one joint and one order.
 
-        {} if it does not apply: other details, or a value of 0.
+        {} if the effect does not have it: its detail is another, or the value is 0 to
+        rounding.
         """
         if any(effect.detail.get(key) != value for key, value in self.detail.items()):
             return {}
@@ -262,7 +270,7 @@ class Part:
 
 @dataclass(frozen=True)
 class HiddenKind:
-    """Kind of effect."""
+    """Kind of hidden effect: place, driver, equation, random draw and expected parameters."""
 
     # Place of the error in the arm, and quantity that drives it
     place: str

@@ -47,10 +47,10 @@ OF_SLIDES: dict[str, HiddenKind] = {}
 
 
 def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
-    """Effect, drawn in rad, in the units of its joints; None if such joints cannot have it.
+    """Convert an effect drawn in rad to the units of its joints; None if they cannot have it.
 
-    ``per_radian``: equivalent of a radian in each joint's unit, (k,). Effects elsewhere than in a
-    joint's angle stay as they are.
+    ``per_radian``: equivalent of a radian in each joint's unit, (k,). Effects elsewhere than
+    in a joint's angle are returned as they are.
     """
     kind = KINDS[effect.kind]
     by = effect.detail.get('by')
@@ -66,7 +66,11 @@ def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect |
 
 
 def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw 0.2 to 0.4 mrad/(N m) for one or two joints whose load varies by over 0.5 N m."""
+    """Draw a compliance of 0.2 to 0.4 mrad/(N m) for one or two joints.
+
+    Of those whose gravity torque varies by over 0.5 N m over the visits; with none the effect
+    has no joints.
+    """
     loaded = 1 + np.flatnonzero(np.ptp(context.circumstances.torque, axis=0) > 0.5)
     count = min(int(context.rng.choice((1, 1, 2))), len(loaded))
     joints = np.sort(context.rng.choice(loaded, count, replace=False))
@@ -75,14 +79,20 @@ def _draw_compliance(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_eccentricity(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw an eccentric encoder of any joint: waves of order 1, 2 or both, 20' in all."""
+    """Draw an eccentric encoder of any joint: waves of order 1, 2 or both.
+
+    Their coefficients are 20 arc minutes times a random unit vector.
+    """
     orders = ((1,), (2,), (1, 2))[context.rng.integers(3)]
     values = 20 * ARC_MINUTE * context.direction(2 * len(orders))
     return HiddenEffect(kind, context.joint(), values, {'orders': orders})
 
 
 def _draw_gear(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw a gear error of any joint: a wave of an even order from 100 to 320, 10 arc minutes."""
+    """Draw a gear error of any joint: a wave of one even order from 100 to 320 per turn.
+
+    Its amplitude is 10 arc minutes.
+    """
     # Twice the ratio of a strain wave gear of 50 to 160.
     order = int(2 * context.rng.integers(50, 161))
     values = 10 * ARC_MINUTE * context.direction(2)
@@ -102,7 +112,10 @@ def _draw_curve(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_link(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw an error of ±5 mm of a link behind joints 1 to k - 1: along it, or along an axis."""
+    """Draw an error of ±5 mm of the link behind one of joints 1 to k - 1.
+
+    Along the link or along x, y or z of the frame after the joint (``axis`` in the detail).
+    """
     joint = int(context.rng.integers(1, context.joints))
     segment = context.circumstances.segments[joint]
     length = np.linalg.norm(segment)
@@ -141,9 +154,9 @@ def _draw_marker_slip(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _about_mean_distance(largest: float) -> Draw:
-    """Draw of a sensor and a sign; the value is ±`largest`.
+    """Return a draw of a random sensor with one value of ±`largest`.
 
-    The mean distance of the sensor's markers is ``distance_m`` in the detail.
+    The detail has ``sensor``, and ``distance_m``, the mean distance of the sensor's markers.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -155,7 +168,10 @@ def _about_mean_distance(largest: float) -> Draw:
 
 
 def _along_axes(name: str) -> tuple[Part, ...]:
-    """Parameters along x, y and z; `name` has ``{axis}`` for the letter."""
+    """Three parameters, along x, y and z, of an effect with three values.
+
+    `name` has ``{axis}`` for the letter.
+    """
     units = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return tuple(Part(name.format(axis=axis), unit) for axis, unit in zip('xyz', units))
 
@@ -170,9 +186,10 @@ def _kind(
     name: str = '',
     power: int | None = 0,
 ) -> Callable[[Rule], Rule]:
-    """Decorator that enters the kind of a rule into a table, by the rule's name or `name`.
+    """Decorator that enters a rule, with its kind, into a table by the rule's name or `name`.
 
-    Other arguments: as the fields of `HiddenKind`; `answers` are its ``accepted``.
+    Other arguments: as the fields of `HiddenKind`; `answers` are its ``accepted``. The rule
+    itself is returned unchanged.
     """
 
     def take(rule: Rule) -> Rule:
@@ -187,23 +204,26 @@ _of_slides = partial(_kind, OF_SLIDES)
 
 
 def _after(e: HiddenEffect, c: Circumstances) -> FloatArray:
-    """1 at configurations after the effect's ``moment_s``, else 0, (n,)."""
+    """1.0 at configurations later than the effect's ``moment_s``, s, else 0.0, (n,)."""
     return (c.time_s > e.detail['moment_s']).astype(float)
 
 
 # A torque is a force at a lever: its unit is in it once more.
 @_named('joint_angle', 'gravity_torque', _draw_compliance, Part('compliance_{j}'), power=-1)
 def joint_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = values_j τ_j, added to ``d.angle``, for each of the joints, rad/(N m)."""
+    """δq_j = values_j τ_j for each of the joints, in rad/(N m), added to ``d.angle``.
+
+    τ_j: gravity's torque about joint j, N m.
+    """
     for value, j in zip(e.values, e.joints, strict=True):
         d.angle[:, j - 1] += value * c.torque[:, j - 1]
 
 
 @_named('joint_angle', 'joint_angle', _draw_eccentricity, *WAVES, power=None)
 def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Per order o in detail: δq = a sin(o q) + b cos(o q), rad, added to ``d.angle``.
+    """δq = a sin(o q) + b cos(o q), rad, summed over orders o, added to ``d.angle`` of the joint.
 
-    Values: a and b of each order, in turn.
+    ``orders`` in the effect's detail; its values: a and b of each order, in turn.
     """
     q = c.q[:, e.joints[0] - 1]
     for order, (a, b) in zip(e.detail['orders'], e.values.reshape(-1, 2), strict=True):
@@ -212,7 +232,7 @@ def encoder_eccentricity(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 
 @_named('joint_angle', 'joint_angle', one_value(5e-3), Part('scale_{j}'), power=1)
 def encoder_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = s q, added to ``d.angle`` of the joint; s: the only value."""
+    """δq = s q, added to ``d.angle`` of the joint; s, without unit, is the only value."""
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.joints[0] - 1]
 
 
@@ -223,9 +243,10 @@ _named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic', p
 
 @_named('joint_angle', 'joint_angle', _draw_curve)
 def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = sum of waves of many orders, none of them slow enough for an eccentricity.
+    """δq = v Σ a cos(o q + phase), added to ``d.angle`` of the joint; v, rad: the only value.
 
-    Added to ``d.angle``; the value, rad, times amplitudes a of the detail: a cos(o q + phase).
+    ``orders`` o, ``amplitudes`` a and ``phases`` are arrays in the effect's detail; no order
+    is low enough for an eccentricity.
     """
     q = (c.q / c.per_radian)[:, e.joints[0] - 1]
     waves = sum(
@@ -244,15 +265,19 @@ def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('half_backlash_{j}', (2.0,)),
 )
 def backlash(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = ½ B sign(last move of the joint), added to ``d.angle``; B, rad, is the only value."""
+    """δq = ½ B (-1, 0 or 1, direction of the last move), added to ``d.angle`` of the joint.
+
+    B, rad, is the only value; the direction is that of the joint's last move above
+    `SLACK_RAD`.
+    """
     d.angle[:, e.joints[0] - 1] += 0.5 * e.values[0] * c.approach[:, e.joints[0] - 1]
 
 
 @_named('joint_angle', 'last_move', one_value(3e-3, positive=True), Part('settling_{j}'), power=1)
 def settling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq = −s (q − q before the move): the arm has not reached its target yet.
+    """δq = −s (q − q before the move), added to ``d.angle``: the arm has not quite arrived.
 
-    Added to ``d.angle``; s, a share, is the only value.
+    s, the share of the move that is missing, is the only value.
     """
     d.angle[:, e.joints[0] - 1] -= e.values[0] * c.move[:, e.joints[0] - 1]
 
@@ -287,9 +312,10 @@ def joint_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     *(Part(f'offset_{axis}_{{j}}', detail={'axis': axis}) for axis in 'xyz'),
 )
 def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = shift of the next joint along the link after joint j, or along an axis of it, m.
+    """Shift of all behind joint j along the link after it, or along one of its axes, m.
 
-    Added to ``d.shift``. The detail's ``axis`` is 'along', 'x', 'y' or 'z'.
+    By the only value, added to ``d.shift``. The detail's ``axis`` is 'along' (the link; also
+    the default), 'x', 'y' or 'z' of the frame after joint j.
     """
     j = e.joints[0]
     axis = e.detail.get('axis', 'along')
@@ -299,7 +325,7 @@ def link_length(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('link_rotation', 'constant', _draw_tilt, *_along_axes('tilt_{axis}_{{j}}'))
 def joint_axis_tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of joint j's frame about its x, y, z before its own rotation, rad.
+    """Constant rotation of joint j's frame about its x, y, z before its own rotation, rad.
 
     The three values are added to ``d.tilt``.
     """
@@ -308,19 +334,25 @@ def joint_axis_tilt(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('marker', 'constant', _draw_marker)
 def marker_offset(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Offset of all markers from the drawing, m along x, y, z of the tool, in ``d.marker``."""
+    """Constant shift of all markers along x, y, z of the tool, m, added to ``d.marker``."""
     d.marker += e.values
 
 
 @_named('link_translation', 'temperature', no_joint(2e-4), Part('growth'))
 def thermal_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Growth of every segment by α ΔT of its length, added to ``d.shift``; α, 1/K: the value."""
+    """Growth of every segment by α ΔT times its length, added to ``d.shift``.
+
+    α, 1/K, is the only value; ΔT: temperature above the first.
+    """
     d.shift += e.values[0] * c.warming_k[:, None, None] * c.segments
 
 
 @_named('base_rotation', 'gravity_moment', no_joint(1e-4), Part('base_compliance'))
 def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of the base per moment of weight about x and y, rad/(N m), added to ``d.base``."""
+    """Rotation of the base about x and y in proportion to the weight's moments about them.
+
+    Added to ``d.base``, rad; the only value is in rad/(N m).
+    """
     d.base[:, :2] += e.values[0] * c.base_moment[:, :2]
 
 
@@ -333,16 +365,21 @@ def base_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('lateral_compliance_{j}'),
 )
 def lateral_compliance(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Add to ``d.tilt`` a rotation of joint j per moment of weight across its axis, rad/(N m)."""
+    """Rotation of joint j's frame in proportion to gravity's moment across its axis.
+
+    Of the moment on all that the joint carries. Added to ``d.tilt``, rad; the only value is in
+    rad/(N m).
+    """
     j = e.joints[0] - 1
     across = np.eye(3) - np.outer(c.axes[j], c.axes[j])
     d.tilt[:, j] += e.values[0] * c.carried_moment[:, j] @ across
 
 
 def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw a rocking of the base by 2 mrad about a horizontal axis beyond a moment, N m.
+    """Draw a base that rocks by 2 mrad about a random horizontal axis, with a threshold.
 
-    The moment about the axis exceeds it at a quarter to three quarters of the visits.
+    The detail has ``axis`` and ``moment``, N m, which the weight's moment about the axis
+    exceeds at a quarter to three quarters of the visits.
     """
     angle = context.rng.uniform(0.0, np.pi)
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
@@ -352,10 +389,10 @@ def _draw_rocking(kind: str, context: DrawContext) -> HiddenEffect:
 
 @_named('base_rotation', 'gravity_moment', _draw_rocking, Part('base_tipping'))
 def base_tipping(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Rotation of the base, rad, from one side to the other if a moment exceeds a value.
+    """Rotation of the base to one of two sides, by whether gravity's moment exceeds a threshold.
 
-    By half the value about the detail's ``axis``, minus that below the ``moment``, N m; added to
-    ``d.base``.
+    About ``axis`` of the detail, by +½ of the value, rad, if the weight's moment about it is
+    above ``moment``, N m, of the detail, else by -½; added to ``d.base``.
     """
     leans = c.base_moment @ e.detail['axis'] > e.detail['moment']
     d.base += e.values[0] * np.where(leans, 0.5, -0.5)[:, None] * e.detail['axis']
@@ -363,9 +400,9 @@ def base_tipping(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('sensor_frame', 'time', of_sensor(1e-6, 3), *_along_axes('drift_{axis}_{{sensor}}'))
 def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Drift of the sensor's readings with this velocity, m/s, in its own frame.
+    """Drift of the sensor's readings with a constant velocity in its own frame N.
 
-    Times the time since the first measurement, added to ``d.sensor_shift``.
+    The values, m/s, times the time since the first measurement, added to ``d.sensor_shift``.
     """
     d.sensor_shift[:, d.sensors.index(e.detail['sensor'])] += c.time_s[:, None] * e.values
 
@@ -378,7 +415,7 @@ def registration_drift(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     Part('scale_{sensor}', detail={'form': 'all'}),
 )
 def sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = s p, or only in depth (z of N).
+    """δp = s p of a sensor's reading p, or only of its depth (z of N); s is the only value.
 
     Added to ``d.scale``; the detail's ``form`` is 'all' or 'depth'.
     """
@@ -388,7 +425,10 @@ def sensor_scale(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_named('sensor_frame', 'position', of_sensor(0.2), Part('radial_{sensor}'))
 def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k r² (x, y, 0), r the distance from the optical axis z, 1/m²; in ``d.radial``."""
+    """δp = k r² (x, y, 0) of a sensor's reading (x, y, z), r its distance from the optical axis z.
+
+    k, 1/m², is the only value, added to ``d.radial``.
+    """
     d.radial[:, d.sensors.index(e.detail['sensor'])] += e.values[0]
 
 
@@ -400,16 +440,19 @@ def sensor_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     power=-1,
 )
 def foreign_torque(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s τ_i: joint j yields to another joint's torque; s in rad/(N m).
+    """δq_j = s τ_i, added to ``d.angle``: joint j yields to the gravity torque of another joint i.
 
-    Added to ``d.angle``; joint i is ``by`` in the detail.
+    Joint i is ``by`` in the detail; s, rad/(N m), is the only value.
     """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.torque[:, e.detail['by'] - 1]
 
 
 @_unnamed('joint_angle', 'time', one_value(1e-6, 2), Part('joint_{j}_by_time'))
 def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s t, added to ``d.angle``; s in rad/s."""
+    """δq_j = s t, added to ``d.angle``; s, rad/s, is the only value.
+
+    t: time since the first measurement, s.
+    """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.time_s
 
 
@@ -417,30 +460,36 @@ def creeping_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     'joint_angle', 'time', at_some_time(one_value(15 * ARC_MINUTE, 2)), Part('joint_{j}_step')
 )
 def slipped_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s from a moment (``moment_s`` in the detail) on, rad, added to ``d.angle``."""
+    """δq_j = s after ``moment_s``, a time in the detail, s; added to ``d.angle``.
+
+    s, rad, is the only value; before that time 0.
+    """
     d.angle[:, e.joints[0] - 1] += e.values[0] * _after(e, c)
 
 
 @_unnamed('joint_angle', 'temperature', one_value(5e-4, 2), Part('joint_{j}_by_temperature'))
 def warm_joint(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s ΔT, added to ``d.angle``; s in rad/K."""
+    """δq_j = s ΔT, added to ``d.angle``; s, rad/K, is the only value.
+
+    ΔT: the arm's temperature above its first, K.
+    """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.warming_k
 
 
 @_unnamed('joint_angle', 'angle', two_joints(3e-3), power=2)
 def bent_coupling(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δq_j = s q_i²: neither a line nor a wave of the other joint.
+    """δq_j = s q_i², added to ``d.angle``: neither a line nor a wave of the other joint.
 
-    Added to ``d.angle``; joint i is ``by`` in the detail.
+    Joint i is ``by`` in the detail; s, 1/rad, is the only value.
     """
     d.angle[:, e.joints[0] - 1] += e.values[0] * c.q[:, e.detail['by'] - 1] ** 2
 
 
 @_unnamed('marker', 'gravity', no_joint(3e-3))
 def sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = s (gravity's direction across the tool's z axis): the marker's stem bends.
+    """Shift of all markers by s times gravity's direction across the tool's z axis, m.
 
-    In m, added to ``d.marker`` of all markers.
+    As if their stem bends; in the tool frame, added to ``d.marker``. s, m, is the only value.
     """
     down = np.swapaxes(c.tool, -1, -2) @ np.array([0.0, 0.0, -1.0])
     d.marker += e.values[0] * (down * (1.0, 1.0, 0.0))[:, None]
@@ -448,9 +497,10 @@ def sagging_tool(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_unnamed('sensor_frame', 'time', at_some_time(_draw_bump))
 def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = v + w × p from a moment on, values (v m, w rad): the sensor was moved.
+    """δp = v + w × p of a sensor's readings p after some time, as if the sensor was moved.
 
-    Added to ``d.sensor_shift`` and ``d.turn``; the moment is ``moment_s`` in the detail.
+    Values: v, m, then w, rad. Added to ``d.sensor_shift`` and ``d.turn`` after ``moment_s`` of
+    the detail.
     """
     s, after = d.sensors.index(e.detail['sensor']), _after(e, c)[:, None]
     d.sensor_shift[:, s] += after * e.values[:3]
@@ -459,18 +509,19 @@ def bumped_sensor(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 @_unnamed('marker', 'time', at_some_time(_draw_marker_slip))
 def slipped_marker(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Shift of one marker on the tool from a moment on, m along its x, y, z.
+    """Shift of one marker on the tool after some time, m along x, y, z of the tool.
 
-    Added to ``d.marker``; the detail has ``marker`` and ``moment_s``.
+    The values, added to ``d.marker`` of ``marker`` after ``moment_s``, both of the detail.
     """
     d.marker[:, d.markers.index(e.detail['marker'])] += _after(e, c)[:, None] * e.values
 
 
 @_unnamed('sensor_frame', 'position', _about_mean_distance(0.05), answers=('sensor_distortion',))
 def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δ = k (|p|/D − 1)² along the line of sight, k in m: zero near the mean distance D.
+    """δ = k (|p|/D − 1)² along the line of sight: zero near the mean distance D.
 
-    D is ``distance_m`` in the detail. Added to ``d.along`` and ``d.scale``.
+    k, m, is the only value; D is ``distance_m`` in the detail. Added to ``d.along`` and
+    ``d.scale``.
     """
     s, k, mean = d.sensors.index(e.detail['sensor']), e.values[0], e.detail['distance_m']
     d.along[:, s, 0] += k
@@ -486,9 +537,10 @@ def range_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     answers=('sensor_distortion', 'sensor_scale'),
 )
 def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k ((|p|/D)² − 1) p: zero at the mean distance D only.
+    """δp = k ((|p|/D)² − 1) p of a sensor's reading p: zero at the mean distance D only.
 
-    D is ``distance_m`` in the detail. Added to ``d.along`` and ``d.scale``.
+    k, without unit, is the only value; D is ``distance_m`` in the detail. Added to ``d.along``
+    and ``d.scale``.
     """
     s = d.sensors.index(e.detail['sensor'])
     d.along[:, s, 2] += e.values[0] / e.detail['distance_m'] ** 2
@@ -497,21 +549,28 @@ def spherical_distortion(e: HiddenEffect, d: Deviation, c: Circumstances) -> Non
 
 @_unnamed('sensor_frame', 'position', of_sensor(0.05, 2), answers=('sensor_distortion',))
 def one_sided_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = z u² k, where u = (x, y)/z along k = values is positive, else zero; in ``d.half``."""
+    """δp = z u² k in x and y if u = (x, y)/z · k/|k| is positive, else 0.
+
+    k: the two values; added to ``d.half``. (x, y, z): the true point in the sensor's frame N.
+    """
     d.half[:, d.sensors.index(e.detail['sensor'])] += e.values
 
 
 def _draw_off_centre(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw a distortion as of `of_sensor`, 0.2 1/m², about a center 0.3 m beside the axis."""
+    """Draw a distortion of a random sensor by ±0.2 1/m² about a center 0.3 m beside the axis.
+
+    The center is ``center`` in the detail, m, (2,), in a random direction.
+    """
     effect = of_sensor(0.2)(kind, context)
     return replace(effect, detail={**effect.detail, 'center': 0.3 * context.direction(2)})
 
 
 @_unnamed('sensor_frame', 'position', _draw_off_centre, answers=('sensor_distortion',))
 def off_centre_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """δp = k |p − c|² (p − c) across the axis z, c not on it; k in 1/m².
+    """δp = k |p − c|² (p − c) in x and y of a sensor's reading p, about a center c off the axis z.
 
-    Added to ``d.radial`` and ``d.center``; c, m, is ``center`` in the detail.
+    k, 1/m², is the only value; c, m, is ``center`` in the detail. Added to ``d.radial`` and
+    ``d.center``.
     """
     s = d.sensors.index(e.detail['sensor'])
     d.radial[:, s] += e.values[0]
@@ -519,17 +578,20 @@ def off_centre_lens(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_lagging(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw a growth of 2e-4 1/K that follows the temperature with a lag of 900 to 4500 s."""
+    """Draw a thermal growth of 2e-4 1/K that lags behind the temperature by 900 to 4500 s.
+
+    A random time constant, ``lag_s`` in the detail.
+    """
     lag = float(context.rng.uniform(900.0, 4500.0))
     return HiddenEffect(kind, (), np.array([2e-4]), {'lag_s': lag})
 
 
 @_unnamed('link_translation', 'temperature', _draw_lagging, answers=('thermal_growth',))
 def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Growth of every segment by α of its length per K of a delayed temperature, 1/K.
+    """Growth of every segment by α times its length per K of a delayed temperature.
 
-    Added to ``d.shift``. The delay is of first order with the time constant ``lag_s`` of the
-    detail.
+    α, 1/K, is the only value. Added to ``d.shift``. The delay is of first order with the time
+    constant ``lag_s``, s, of the detail.
     """
     # The thermometer's temperature is a line between two configurations.
     tau, slow = e.detail['lag_s'], np.zeros(len(c.time_s))
@@ -542,9 +604,10 @@ def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_guide(largest: float) -> Draw:
-    """Draw of a wave of one half to one and a half periods along a random slide.
+    """Return a draw of a wave of half to one and a half periods along a random joint that slides.
 
-    Its value is `largest`, its axis across the slide; 0 at joint 1 if nothing slides.
+    The value is `largest`, 0 at joint 1 if nothing slides. The detail has ``axis``, a unit
+    vector across the slide, ``per_m``, rad/m, and ``phase``.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -563,22 +626,26 @@ def _draw_guide(largest: float) -> Draw:
 
 
 def _along_guide(e: HiddenEffect, c: Circumstances) -> FloatArray:
-    """Wave of the place of a slide, along the effect's axis, m or rad, (n, 3)."""
+    """Wave of a slide's reported position, times the effect's value and axis, m or rad, (n, 3)."""
     wave = np.sin(e.detail['per_m'] * c.q[:, e.joints[0] - 1] + e.detail['phase'])
     return e.values[0] * wave[:, None] * e.detail['axis']
 
 
 @_of_slides('link_translation', 'own_place', _draw_guide(2e-3), answers=('guide_straightness',))
 def crooked_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Shift of the carriage of joint j across its way, a wave of its place, m, in ``d.shift``."""
+    """Shift of the carriage of sliding joint j across its way, a sine of its position.
+
+    m, added to ``d.shift``; axis, period and phase are in the detail.
+    """
     d.shift[:, e.joints[0]] += _along_guide(e, c)
 
 
 @_of_slides('link_rotation', 'own_place', _draw_guide(2e-3), answers=('guide_pitch',))
 def pitching_guide(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
-    """Turn of the carriage of joint j about an axis across its way, a wave of its place, rad.
+    """Rotation of the carriage of sliding joint j across its way, a sine of its position.
 
-    Added to ``d.tilt``, and to ``d.shift`` so that the carriage stays in its place.
+    About an axis across the way, rad, added to ``d.tilt``, and to ``d.shift`` so that the
+    carriage stays in its place.
     """
     j, turn = e.joints[0], _along_guide(e, c)
     d.tilt[:, j - 1] += turn
@@ -590,15 +657,15 @@ KINDS = NAMED | UNNAMED | OF_SLIDES
 
 
 def add_effect(effect: HiddenEffect, deviation: Deviation, c: Circumstances) -> None:
-    """Add the contribution of an effect, in its circumstances, to a deviation, in place."""
+    """Add an effect's errors, by the rule of its kind, to the arrays of a deviation, in place."""
     KINDS[effect.kind].rule(effect, deviation, c)
 
 
 def true_parameters(effect: HiddenEffect) -> dict[str, float]:
-    """True parameters of an effect, SI units, under their names in discovery.
+    """True values of an effect's parameters, SI units, by their names in a discovery.
 
-    Empty if none can be compared: a curve, a marker (of which only parts can be seen), and effects
-    without a name that are more than a line.
+    {} if none can be compared: a curve, a marker (of which only parts can be seen), and most
+    effects without a name.
     """
     return {
         name: value
@@ -609,7 +676,7 @@ def true_parameters(effect: HiddenEffect) -> dict[str, float]:
 
 
 def _each(effect: HiddenEffect) -> list[HiddenEffect]:
-    """The effect separately for each joint, a wave separately for each order; else [effect]."""
+    """Split an effect into one for each joint, or waves into one for each order; else [effect]."""
     if len(effect.joints) > 1:
         return [
             replace(effect, joints=(joint,), values=np.array([value]))

@@ -85,7 +85,7 @@ class FakeLaserTracker:
 
     @property
     def locked(self) -> bool:
-        """Whether the beam is on the reflector."""
+        """Whether the beam is locked on a reflector."""
         return self._instrument.locked
 
     def start(self) -> None:
@@ -121,7 +121,10 @@ class FakeLaserTracker:
             self._send(self._instrument.break_beam())
 
     def _serve(self) -> None:
-        """Serve one client until `_closing` is set: faults, steps of the instrument, commands."""
+        """Serve one client at a time until `close`: faults, steps of the instrument, commands.
+
+        With the fault 'stuck' the instrument stands still and commands wait.
+        """
         while not self._closing.is_set():
             ready = [key.fileobj for key, _ in self._selector.select(_POLL_WALL_S)]
             began_s = self._world.now()
@@ -140,7 +143,10 @@ class FakeLaserTracker:
         self._drop_client()
 
     def _instrument_time(self, faults: Numbers) -> float:
-        """World time, s, slower for an instrument with the fault ``slow``: its loss remains."""
+        """World time of the instrument, s, which runs slower by the number of the fault ``slow``.
+
+        What it lags behind the World remains after the fault has ended.
+        """
         now = self._world.now()
         passed, self._looked_at = now - self._looked_at, now
         self._lost_s += passed * (1.0 - 1.0 / faults.get('slow', 1.0))
@@ -149,8 +155,8 @@ class FakeLaserTracker:
     def _apply(self, faults: Numbers) -> None:
         """Apply the injected faults of the connection and the power.
 
-        'off' drops the client, 'renumbered' switches the instrument off and on once, 'garbage'
-        sends 64 random bytes.
+        'off' drops the client, 'renumbered' drops it and switches the instrument off and on
+        once, 'garbage' sends 64 random bytes.
         """
         if 'off' in faults:
             self._drop_client()
@@ -171,9 +177,9 @@ class FakeLaserTracker:
                 self._client.sendall(self._rng.bytes(64))
 
     def _accept(self) -> None:
-        """Accept a client and greet it.
+        """Accept a connection, and send the client the first packets of the instrument.
 
-        A second client is refused, and any client while the fault 'off' is set.
+        A second client gets an error report and is closed; with the fault 'off' any is closed.
         """
         assert self._listener is not None
         try:

@@ -26,12 +26,12 @@ _SIGHT_EVERY_S = 0.5
 
 
 class Beam:
-    """Direction of the instrument, and whether it is locked on the reflector.
+    """Laser beam of the tracker: its direction, and whether it is locked on a reflector.
 
     ``world, sensor``: the hidden world, and the tracker's name in it; ``t``: world time, s;
     ``aim``: first aim in the tracker's frame, m, (3,), or None for the reflector; ``further``:
-    further reflectors of the tool by name, with their numbers for the fault ``hidden``; the first
-    has the name '' and the number 1.
+    further reflectors of the tool by name, with their numbers for the fault ``hidden``; the
+    first has the name '' and the number 1.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class Beam:
         self._move_judged = False
 
     def reflector(self, t: float) -> FloatArray:
-        """True position of the present reflector at time t, s, m in the tracker's frame, (3,)."""
+        """True position of the selected reflector in the tracker's frame at time t, s, m, (3,)."""
         return self._world.marker_in_sensor(self._sensor, t, self._on)
 
     def sees(self, t: float) -> bool:
-        """Whether the line of sight to the present reflector is free at time t, s.
+        """Whether the line of sight to the selected reflector is free at world time t, s.
 
         False also with the fault ``hidden`` of this reflector's number.
         """
@@ -91,9 +91,9 @@ class Beam:
     def follow(self, t: float) -> bool:
         """Follow the reflector for a step that ends at time t, s; False if the beam loses it.
 
-        It does if the reflector is hidden (looked up at every step while the arm moves, else every
-        0.5 s), outruns it, or a large move shakes it. The aim stays where it was lost. Meant for a
-        locked beam.
+        The beam loses it if it is hidden (looked up at every step while the arm moves, else
+        every 0.5 s), outruns the beam, or a large move shakes it. The beam is then not locked,
+        and the aim stays where the reflector was lost. Meant for a locked beam.
         """
         reflector, moving = self.reflector(t), self._world.is_moving(t)
         across_speed = angle_between(self.aim, reflector) * np.linalg.norm(reflector) / STEP_S
@@ -109,10 +109,10 @@ class Beam:
         return self.locked
 
     def _shaken(self, t: float, moving: bool) -> bool:
-        """Whether a large move breaks the beam now; a random decision, once for each move.
+        """Decide whether a large move breaks the beam in this step; at random, once for each move.
 
-        A move is large once its fastest joint has swept ``large_move_rad``. `t`: end of the step,
-        s; ``moving``: whether the arm moves then.
+        A move is large once the way of the fastest joint, summed over steps, is over
+        ``large_move_rad``. `t`: end of the step, s; ``moving``: whether the arm moves then.
         """
         if not moving:
             self._swept_rad, self._move_judged = 0.0, False
@@ -132,7 +132,8 @@ def angle_between(a: FloatArray, b: FloatArray) -> float:
 def covariance(position: FloatArray, behaviour: TrackerBehaviour) -> FloatArray:
     """Covariance of a measured position, m², (3, 3), with independent errors of range and angles.
 
-    The limits of a data sheet are two standard deviations.
+    By the accuracy limits in ``behaviour``, which are two standard deviations. ``position``:
+    in the tracker's frame, m, (3,).
     """
     b = behaviour
     distance = np.linalg.norm(position)
@@ -148,10 +149,10 @@ def adm_result(
     unit_m: float,
     environment: tuple[float, float, float],
 ) -> Measurement:
-    """Packet of a measured position and its standard deviation (m, (3,) each).
+    """Packet of a measured position, m, (3,), and its standard deviation, m, (3,).
 
-    ``unit_m``: the client's unit of length, m; ``environment``: temperature (°C), pressure (mbar),
-    relative humidity (%).
+    ``unit_m``: the client's unit of length, m, to which they are converted; ``environment``:
+    temperature (°C), pressure (mbar), relative humidity (%).
     """
     x, y, z = (position / unit_m).tolist()
     std_x, std_y, std_z = (std / unit_m).tolist()

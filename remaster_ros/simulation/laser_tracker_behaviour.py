@@ -50,7 +50,7 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class TrackerBehaviour:
-    """Settings of the fake tracker; world time in s, lengths in m."""
+    """Durations, speeds, accuracy and failure rates of the fake tracker; world time in s, m."""
 
     # Time from switching on until it can be initialised (two hours on a real one)
     warm_up_s: float = 5.0
@@ -81,8 +81,9 @@ class TrackerBehaviour:
 def refusal(command: Command, values: tuple[Value, ...]) -> Status:
     """Status with the reason why a setting is refused, or `Status.ALL_OK`.
 
-    Refused are values that are not finite, other units than those of `LENGTH_UNITS_M` with 0 for
-    angles, temperature and humidity, modes other than 0, unknown reflectors, and air or search
+    ``command``: that sets it; ``values``: its arguments. Refused are values that are not
+    finite; lengths in other units than `LENGTH_UNITS_M`, pressure in other units than mbar or
+    hPa, and any other unit than 0; modes other than 0; unknown reflectors; air or search
     values out of range.
     """
     numbers = np.array(values, float)

@@ -50,12 +50,12 @@ _TAKES_TIME = (
 
 
 class TrackerInstrument:
-    """Instrument without sockets, threads and clocks.
+    """Fake laser tracker's instrument: commands to answers, without sockets, threads and clocks.
 
     ``world``: the hidden world; ``sensor``: the tracker's name in it; ``switched_on_s``: world
-    time of switching on, s; ``aim``: first aim in the tracker's frame, m, (3,), or None for the
-    reflector, as after set-up by a person; ``further``: further reflectors of the tool, as in
-    `Beam`.
+    time of switching on, s; ``aim``: first aim in the tracker's frame, m, (3,), or None for
+    the reflector, as after set-up by a person; ``further``: further reflectors of the tool, as
+    in `Beam`.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class TrackerInstrument:
 
     @property
     def locked(self) -> bool:
-        """Whether the beam is on the reflector."""
+        """Whether the beam is locked on a reflector."""
         return self._beam.locked
 
     @property
@@ -93,13 +93,14 @@ class TrackerInstrument:
         return Readiness.READY if self.locked else Readiness.NOT_READY
 
     def greeting(self) -> list[Event]:
-        """First packets for a client that connects."""
+        """First packets for a client that connects: the present readiness."""
         return [self._readiness_change()]
 
     def handle(self, request: Request) -> list[Event]:
-        """Handle a command at the time of the last step; the immediate answers are returned.
+        """Handle a client's command at the time of the last step; return the packets to send now.
 
-        An unknown command is answered by NOT_IMPLEMENTED.
+        An unknown command is answered by NOT_IMPLEMENTED. A command that takes time ends in
+        `step`.
         """
         command = request.command
         if command in SETTINGS:
@@ -114,9 +115,9 @@ class TrackerInstrument:
         return self._sent()
 
     def step(self, t: float) -> list[Event]:
-        """Advance to world time t, s, in steps of 0.1 s; the packets sent meanwhile are returned.
+        """Advance to world time t, s, in steps of 0.1 s; return the packets sent meanwhile.
 
-        Of a delay only the last 5 s are made up for.
+        If t is more than 5 s ahead, only the last 5 s are simulated.
         """
         self._time = max(self._time, t - _LONGEST_CATCH_UP_S)
         while t - self._time >= STEP_S:
@@ -127,27 +128,30 @@ class TrackerInstrument:
         return self._sent()
 
     def abort(self) -> None:
-        """End the present command, as when the client disconnects; nothing without one."""
+        """End the present command without an answer, as when the client disconnects.
+
+        Nothing if there is none.
+        """
         if self._operation is not None:
             self._operation = None
             self._out.append(self._readiness_change())
 
     def break_beam(self) -> list[Event]:
-        """Lose the reflector, as when a person walks through the beam; the packets to send."""
+        """Unlock the beam, as when a person walks through it; return the packets to send."""
         self._lose()
         return self._sent()
 
     def _sent(self) -> list[Event]:
-        """Packets that were to be sent, in order; they are forgotten here."""
+        """Return the packets that wait to be sent, in order, and empty their list."""
         out, self._out = self._out, []
         return out
 
     def _reply(self, command: Command, status: int = 0, values: tuple[Value, ...] = ()) -> None:
-        """Put a reply to a command among the packets to be sent."""
+        """Append a reply to a command to the packets that wait to be sent."""
         self._out.append(Reply(command, status, values))
 
     def _readiness_change(self) -> StatusChange:
-        """Status change that reports the present state of readiness."""
+        """Packet that reports the present readiness; it is returned only, not sent."""
         # The three changes have the order of the three states.
         return StatusChange(Change.NOT_READY + self.readiness)
 
@@ -174,13 +178,16 @@ class TrackerInstrument:
             self._out.append(StatusChange(setting.change))
 
     def _convert_lengths(self, unit: int) -> None:
-        """Convert the search radius to a new unit, an index of `LENGTH_UNITS_M`."""
+        """Convert the search radius in the settings to a new unit, an index of `LENGTH_UNITS_M`.
+
+        To be called before the new unit is set.
+        """
         radius, timeout = self._settings[Command.GET_SEARCH]
         scale = self._unit_m / LENGTH_UNITS_M[unit]
         self._settings[Command.GET_SEARCH] = (float(radius) * scale, timeout)
 
     def _answers(self, command: Command) -> list[tuple[Value, ...]]:
-        """Values of each reply to a query; empty if the command is no query."""
+        """Values of each reply to a query (a reading command); [] if the command is no query."""
         if command in self._settings:
             return [self._settings[command]]
         if command is Command.GET_TRACKER_STATUS:
@@ -199,7 +206,7 @@ class TrackerInstrument:
     # Commands that take time
 
     def _begin(self, command: Command, values: tuple[Value, ...]) -> None:
-        """Start a command's operation and advance it once; reply with the status if refused."""
+        """Begin a command that takes time, with a first step; if refused, reply with why."""
         status = self._why_not(command, values)
         if status != Status.ALL_OK:
             self._reply(command, status)
@@ -212,10 +219,11 @@ class TrackerInstrument:
         self._advance()
 
     def _start(self, command: Command, values: tuple[Value, ...]) -> Operation:
-        """Operation of a command that takes time: measurement, initialisation or a search.
+        """Generator of a command that takes time (measurement, initialisation or search).
 
-        A search begins at the present aim (FIND_REFLECTOR, with a distance) or at a position
-        (GO_POSITION), in the client's unit of length.
+        Each step of 0.1 s advances it once. A search begins at the present aim
+        (FIND_REFLECTOR, with a distance) or at a position (GO_POSITION); ``values``: these, in
+        the client's unit of length.
         """
         if command is Command.START_MEASUREMENT:
             return self._measure()
@@ -255,7 +263,7 @@ class TrackerInstrument:
             self._out.append(self._readiness_change())
 
     def _initialize(self) -> Operation:
-        """Operation that unlocks the beam, waits, and reports the instrument initialised."""
+        """Operation that unlocks the beam, waits, replies, and reports the initialisation."""
         self._beam.locked = False
         yield from self._wait(self.behaviour.initialise_s)
         self._initialized = True
@@ -278,10 +286,11 @@ class TrackerInstrument:
         self._beam.aim = target
 
     def _search(self, command: Command, target: FloatArray, distance: float) -> Operation:
-        """Turn to the target and search in a spiral about it; lock on what is found, and reply.
+        """Operation that turns to a target and searches in a spiral about it, then replies.
 
-        A spiral of pitch p at speed v reaches the radius r after π r² / (p v). It ends at the
-        radius or time of the settings. ``target``: m, (3,); ``distance``: of the reflector, m.
+        It locks on a reflector that is found. A spiral of pitch p at speed v reaches the
+        radius r after π r² / (p v). The search ends at the radius or time of the settings;
+        some fail at random. ``target``: m, (3,); ``distance``: of the reflector, m.
         """
         b = self.behaviour
         search_radius, timeout_ms = self._settings[Command.GET_SEARCH]
@@ -303,9 +312,10 @@ class TrackerInstrument:
         self._reply(command, Status.ALL_OK if found else Status.MEASUREMENT_STATUS_NOT_READY)
 
     def _measure(self) -> Operation:
-        """Measurement as an operation: a result, or an error if beam breaks or target moves.
+        """Operation that measures the reflector, and puts a result or an error among the packets.
 
-        The target moves if it leaves 50 µm (``stability_limit_m``) about its first place.
+        An error if the beam breaks, or the reflector leaves 50 µm (``stability_limit_m``)
+        about its first position.
         """
         integration_ms, _ = self._settings[Command.GET_STATIONARY_MODE]
         end = self._time + int(integration_ms) * 1e-3
@@ -324,7 +334,10 @@ class TrackerInstrument:
             self._out.append(ErrorReport(Command.START_MEASUREMENT, problem))
 
     def _result(self, truth: FloatArray) -> Measurement:
-        """Measurement of a point, m, (3,), with noise, its std and the weather station's data."""
+        """Packet of a measurement of a true point, m, (3,), with random noise and its std.
+
+        With the temperature, pressure and humidity of the air.
+        """
         cov = covariance(truth, self.behaviour)
         position = self._rng.multivariate_normal(truth, cov)
         temperature, pressure, humidity = map(float, self._settings[Command.GET_ENVIRONMENT])

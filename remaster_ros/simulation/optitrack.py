@@ -190,7 +190,10 @@ class FakeOptiTrackServer:
                 self._distribute(message)
 
     def _distribute(self, frame: Frame | bytes) -> None:
-        """Send a frame or raw bytes to the group, or to each client in the client's version."""
+        """Send a frame or raw bytes to the multicast group, or to each unicast client.
+
+        To each client in its own bitstream version.
+        """
         if self._data is not None:
             self._send(frame, self._group, self._version, self._data)
             return
@@ -200,7 +203,10 @@ class FakeOptiTrackServer:
             self._send(frame, (host, self._unicast_port or port), version)
 
     def _serve(self) -> None:
-        """Answer the command channel until stopped; datagrams that are no requests are ignored."""
+        """Answer requests on the command port, and forget silent clients, until stopped.
+
+        Datagrams that are no requests are ignored; with the fault 'off' all are.
+        """
         assert self._command is not None
         while not self._closing.is_set():
             self._forget_silent_clients()
@@ -218,9 +224,9 @@ class FakeOptiTrackServer:
                 self._send(answer, address, self._version_of(address))
 
     def _answers(self, request: ClientRequest, address: Address) -> list[Message]:
-        """Execute a request; most have one answer, some have none.
+        """Carry out a client's request and return its answers: one of most, none of some.
 
-        Unknown ones are answered by UNRECOGNIZED_REQUEST.
+        An unknown request is answered by UNRECOGNIZED_REQUEST.
         """
         if request.id == MessageId.CONNECT:
             self._welcome(address, request.wanted_version)
@@ -241,9 +247,10 @@ class FakeOptiTrackServer:
         return [] if request.id == MessageId.KEEPALIVE else [_UNRECOGNIZED]
 
     def _welcome(self, address: Address, wanted: Version | None) -> None:
-        """Register a unicast client with the wanted bitstream or else the server's own.
+        """Register a unicast client, with the wanted bitstream version if it can be streamed.
 
-        Beyond `MAX_CLIENTS`, the client seen longest ago is removed. Nothing in multicast.
+        Else with the server's own. Beyond `MAX_CLIENTS`, the client that was silent longest is
+        removed. Nothing in multicast.
         """
         if self._transport != 'unicast':
             return
@@ -254,7 +261,7 @@ class FakeOptiTrackServer:
                 self._clients.pop(min(self._clients, key=lambda a: self._clients[a].last_seen_s))
 
     def _server_info(self) -> natnet.ServerInfo:
-        """Answer to CONNECT with the versions of this server, and its connection from 3.0 on."""
+        """Answer to CONNECT: versions of this server, and from 3.0 on its clock and data port."""
         group, data_port = self._group
         connection = natnet.Connection(CLOCK_HZ, data_port, self._data is not None, group)
         return natnet.ServerInfo(
@@ -265,10 +272,10 @@ class FakeOptiTrackServer:
         )
 
     def _obey(self, command: str, address: Address) -> Message:
-        """Answer to a REQUEST: the frame rate, or the bitstream, which an argument sets.
+        """Answer to the text of a REQUEST: 'FrameRate', or 'Bitstream' with or without argument.
 
-        Refused if the client is unknown or cannot have that version; unrecognized for other
-        commands.
+        'Bitstream,VERSION' sets the client's version first. It is refused if the client is
+        unknown or cannot have that version. Any other text is unrecognized.
         """
         name, _, argument = command.partition(',')
         if name == 'FrameRate':
@@ -287,9 +294,9 @@ class FakeOptiTrackServer:
         return natnet.Response(f'Bitstream,{version}\0'.encode())
 
     def _can_stream(self, wanted: Version) -> bool:
-        """Whether a client gets this bitstream on request.
+        """Whether a client gets this bitstream version if it asks for it.
 
-        Servers from 4.0 on stream any from 3.0 to their own.
+        Servers from 4.0 on stream any from 3.0 to their own; older ones refuse every request.
         """
         return self._version >= (4, 0) and (3, 0) <= wanted <= self._version
 
@@ -300,9 +307,9 @@ class FakeOptiTrackServer:
         return client.version if client is not None else self._version
 
     def _forget_silent_clients(self) -> None:
-        """Remove clients silent for `client_timeout_s`, and notify each.
+        """Remove clients that were silent for over `client_timeout_s`, wall time, and notify each.
 
-        None is removed with a `unicast_port`.
+        With a `unicast_port` none is removed.
         """
         if self._unicast_port is not None:
             return
@@ -322,7 +329,10 @@ class FakeOptiTrackServer:
         version: Version,
         through: socket.socket | None = None,
     ) -> None:
-        """Send a message in a bitstream version, or raw bytes; network failures are ignored."""
+        """Send a message in a bitstream version, or raw bytes; network failures are ignored.
+
+        ``through``: socket; None for that of the command port.
+        """
         # A network that is down loses datagrams, as everywhere; the server goes on.
         sender = through or self._command
         assert sender is not None

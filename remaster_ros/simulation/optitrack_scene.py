@@ -39,7 +39,7 @@ _GARBAGE_BYTES = 300
 
 
 class FrameFaults:
-    """Faults of the frames that are sent."""
+    """Applies injected faults to the frames of the fake OptiTrack server before they are sent."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -49,10 +49,10 @@ class FrameFaults:
         self._begins_at: Frame | None = None
 
     def spoil(self, frame: Frame, faults: Numbers) -> Iterator[Frame | bytes]:
-        """Yield the frames or raw bytes that are sent in place of a frame, which may be none.
+        """Yield the frames or raw bytes to be sent in place of a frame, or nothing.
 
-        ``faults``: as in `faults.OF_OPTITRACK`. Frames are kept for later calls by 'late',
-        'reordered', 'frozen' and 'renumbered'.
+        ``faults``: fault -> number, as in `faults.OF_OPTITRACK`. 'late' and 'reordered' keep
+        frames for later calls, 'frozen' and 'renumbered' the first frame with the fault.
         """
         if 'frozen' not in faults:
             self._frozen = None
@@ -138,7 +138,7 @@ class OptiTrackBehaviour:
 
 
 class OptiTrackScene:
-    """Frames of data of a fake camera bar.
+    """Frames of marker data of a fake camera bar, from the hidden world.
 
     ``sensor``: the bar's name in the world.
     """
@@ -177,7 +177,10 @@ class OptiTrackScene:
 
     @property
     def model(self) -> ModelDefinition:
-        """Rigid body, with marker positions about their mean, m, and its marker sets."""
+        """Descriptions of the rigid body and of its marker sets.
+
+        The body's marker positions are about their mean, m, as at the start.
+        """
         behaviour = self._behaviour
         names = tuple(f'{behaviour.rigid_body}_{i + 1}' for i in range(len(self._offsets)))
         body = RigidBodyDescription(
@@ -196,10 +199,11 @@ class OptiTrackScene:
         )
 
     def frame(self, number: int, version: Version, t: float | None = None) -> Frame:
-        """Frame of the world now, or sent at time t, s.
+        """Frame of marker data that is sent at world time t, s, or now if t is None.
 
-        ``number``: of the frame; ``version``: bitstream of the server: NatNet 2 has fewer flags
-        and no residual. With a camera's timing it shows the world before it is sent.
+        With a camera's timing it shows the world some time before. Noise and occlusions are
+        drawn in each call. ``number``: of the frame; ``version``: bitstream of the server:
+        NatNet 2 has fewer flags and no residual.
         """
         behaviour, size = self._behaviour, len(self._offsets)
         sent_s = self._world.now() if t is None else t
@@ -263,19 +267,23 @@ class OptiTrackScene:
         )
 
     def ticks(self, t: float) -> int:
-        """Server's fine clock at world time t, s; it began 1000 s earlier, as on a real host."""
+        """Server's fine clock at world time t, s, in ticks of `CLOCK_HZ`.
+
+        It began 1000 s before the scene, as on a real host, and has the camera's drift.
+        """
         return round((self._by_its_clock(t) + 1000.0) * CLOCK_HZ)
 
     def _by_its_clock(self, t: float) -> float:
-        """Time since the start by the server's clock, s, at world time t."""
+        """Time since the start by the server's clock, which may drift, s, at world time t, s."""
         timing = self._world.camera(self._sensor)
         return (t - self._start_s) * (1.0 if timing is None else 1.0 + timing.drift)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
-        """Flags of the hidden marker at world time t, s; None while all are visible.
+        """Flags of the markers that are hidden at world time t, s; None if none is.
 
-        ``tracked``: whether the line of sight is free. Occlusions are planned here, and their
-        flags and guessed errors drawn.
+        ``tracked``: whether the line of sight is free: if not, all are hidden, else one
+        (`_hidden_place`). Occlusions are planned here, and their flags and guessed errors
+        drawn.
         """
         start, end = self._occlusion
         if t >= end:
@@ -296,7 +304,7 @@ class OptiTrackScene:
         return self._hidden_params
 
     def _label_index(self, number: float) -> int:
-        """Index among the labels of the marker with this number in the body.
+        """Index in `_labels` of the rigid body's marker with this number.
 
         Raises ValueError if there is none.
         """

@@ -48,12 +48,12 @@ class FakeArm:
     def command(
         self, names: Sequence[str], points: Sequence[ServoPoint], start_s: float = 0.0
     ) -> str | None:
-        """Follow a trajectory.
+        """Follow a trajectory, in place of the present one; a refused one changes nothing.
 
         ``names, points``: as in the message; ``start_s``: stamp of the header, s, 0 for now.
-        Returns the reason why the trajectory was dropped, for the log; None if the arm follows it.
-        Each move misses its target by a random error, 20 µrad in each joint, the same for all
-        parts with one stamp.
+        Returns the reason why the trajectory was dropped, for the log; None if the arm follows
+        it. Each move misses its target by a random error, of 20 µrad standard deviation in
+        each joint, the same for all parts with one stamp.
         """
         now = self.world.now()
         faults = self.world.faults('robot')
@@ -87,7 +87,7 @@ class FakeArm:
     ) -> str | None:
         """Reason why a trajectory is refused, in a controller's words; None if it is accepted.
 
-        `start_s`: stamp of the trajectory, s, 0 for at once; `now`: present time, s.
+        ``start_s``: stamp of the trajectory, s, 0 for at once; ``now``: present world time, s.
         """
         unknown = sorted(set(names) - set(self.names))
         missing = sorted(set(self.names) - set(names))
@@ -117,8 +117,9 @@ class FakeArm:
     def joint_state(self) -> tuple[float, list[str], FloatArray, FloatArray] | None:
         """Present report: time (s), joint names in the arm's own order, positions, velocities.
 
-        With encoder noise and the faults of the robot. None if nothing is reported: the robot is
-        off, or a report is lost. An emergency stop brakes the arm here.
+        With encoder noise and the faults of the robot, rad and rad/s (m for slides), (k,), in
+        the order of the names. None if nothing is reported: the robot is off, or a report is
+        lost. An emergency stop brakes the arm in the first call.
         """
         now, faults = self.world.now(), self.world.faults('robot')
         if not _is_stopped(faults):
@@ -166,9 +167,10 @@ class FakeArm:
         return 2 if 'doubled' in self.world.faults('robot') else 1
 
     def _wrap(self, faults: Numbers) -> FloatArray:
-        """Error of the positions by a joint that is a turn off, rad, (k,), 0 without such a fault.
+        """Error of the reported positions by a joint that is a turn off, rad, (k,); else zeros.
 
-        Of ``wrapped_once`` only in the first call while the fault is set.
+        By the fault ``wrapped`` in each call; by ``wrapped_once`` only in the first one with
+        it.
         """
         turn = np.zeros(len(self.names))
         if 'wrapped' in faults:
@@ -179,7 +181,7 @@ class FakeArm:
         return turn
 
     def _brake(self, now: float) -> None:
-        """Brake to a standstill within 0.15 s, as an emergency stop does."""
+        """Brake the arm to a standstill within 0.15 s from ``now``, world time, s."""
         self._braked = True
         q, velocity = self.world.reported(now)
         braking_s = 0.15
@@ -193,7 +195,7 @@ def _is_stopped(faults: Numbers) -> bool:
 
 
 def _fault_reason(faults: Numbers, now: float) -> str:
-    """Reason why a faulty robot accepts no command at time `now`, s; '' if it does."""
+    """Reason why a robot with these faults accepts no command at time `now`, s; '' if it does."""
     for name in ('off', 'dropped', 'estop', 'estop_reported'):
         if name in faults:
             return f'fault injected: {name}'

@@ -29,10 +29,10 @@ PLACEMENT_STD_M = 0.03
 
 
 def default_folder(namespace: str = '/') -> Path:
-    """Folder of the fakes of this user, DDS domain and ROS namespace; it is not made.
+    """Folder of the World of this user, DDS domain and ROS namespace; it is not made.
 
-    ``namespace``: such as ``/left``; every cell of a domain has its own World. In the temporary
-    directory; the domain is ROS_DOMAIN_ID, 0 if unset.
+    In the temporary directory; the domain is ROS_DOMAIN_ID, 0 if unset. ``namespace``: such as
+    ``/left``; every cell of a domain has its own World.
     """
     domain = os.environ.get('ROS_DOMAIN_ID', '0')
     cell = namespace.rstrip('/').replace('/', '.')
@@ -89,7 +89,7 @@ def make_world(
     candidates: int = PRACTICE_CANDIDATES,
     dynamics: float = 0.0,
 ) -> World:
-    """Random hidden World for a cell; its time begins now.
+    """Make a random hidden World for a cell, and write its folder; its time begins now.
 
     Parameters
     ----------
@@ -109,6 +109,12 @@ def make_world(
     dynamics
         Scale of the arm's hidden dynamics, 1 for sizes of real machines; 0: the encoders see all
         of its motion, and frames are sent at the time that they show.
+
+    Raises
+    ------
+    InputError
+        config/fake_world.yaml places no sensor of a name in the cell, an effect cannot be seen,
+        or no pose can be reached on which its size is measured.
     """
     settings = yaml.safe_load(config_path('fake_world.yaml').read_text())
     chain = cell.chain()
@@ -163,9 +169,9 @@ def make_world(
 
 
 def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
-    """First positions of a fake arm, rad or m, (k,), by the angles of its first joints.
+    """First positions of a fake arm, rad or m, (k,); ``angles``: those of its first joints.
 
-    Further joints are at 0, those that slide in the middle of their range.
+    Further joints are at 0; all joints that slide are in the middle of their range.
     """
     q = np.zeros(len(chain))
     known = min(len(chain), len(angles))
@@ -175,9 +181,9 @@ def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
 
 
 def open_world(folder: str, namespace: str = '/', timeout_s: float = 20.0) -> World:
-    """World in `folder` ('' for the default one), opened as soon as it has been made.
+    """Open the World in `folder` ('' for the default one), waiting until it has been made.
 
-    ``folder, namespace``: see `default_folder`; ``timeout_s``: longest wait, wall time, s. Raises
+    ``namespace``: see `default_folder`; ``timeout_s``: longest wait, wall time, s. Raises
     InputError if there is none after `timeout_s`, or the default folder is not private.
     """
     path = Path(folder) if folder else default_folder(namespace)

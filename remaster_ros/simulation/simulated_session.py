@@ -47,21 +47,22 @@ def simulate_session(
     effects: Sequence[EffectSpec] = (),
     effect_rng: np.random.Generator | None = None,
 ) -> tuple[Session, SessionTruth]:
-    """Session of a robot with random truth that visits the poses, with noise.
+    """Simulate a session, with noise, of a robot with random true errors that visits the poses.
 
-    ``chain, urdf``: nominal robot with k joints, and its URDF text; ``poses, validation_poses``:
-    for each pose its joint solutions in the order visited, rad, (m, k); ``sensors``: by name; at
-    every configuration each gives an observation of each of its markers, from one frame;
-    ``markers``: nominal positions in the tool frame, m, (3,); true positions have the standard
-    deviation ``marker_std_m``; ``joint_offsets``: true zero-offsets, rad or m, (k,), or None for
-    draws from N(0, ``joint_offset_std``²), times `SerialChain.per_radian` for a joint that slides;
-    ``outlier_share``: share of the observations shifted by ``outlier_m`` in a random direction;
-    ``warming``: of the arm, measured as well, or None if no temperature is measured; ``effects,
-    effect_rng``: effects of the arm or the sensors, and their source of randomness.
+    ``chain, urdf``: nominal robot with k joints, and its URDF text; ``poses,
+    validation_poses``: for each pose its joint solutions in the order visited, rad, (m, k);
+    ``sensors``: by name; at every configuration each gives an observation of each of its
+    markers, from one frame; ``markers``: nominal positions in the tool frame, m, (3,); true
+    positions have the standard deviation ``marker_std_m``; ``joint_offsets``: true
+    zero-offsets, rad or m, (k,), or None for draws from N(0, ``joint_offset_std``²), times
+    `SerialChain.per_radian` for a joint that slides; ``outlier_share``: share of the
+    observations shifted by ``outlier_m`` in a random direction; ``warming``: of the arm,
+    measured as well, or None if no temperature is measured; ``effects, effect_rng``: effects
+    of the arm or the sensors, and their source of randomness.
 
-    Returns the session, with no more in it than a recorded one, and its truth. Raises InputError
-    if solutions have a wrong shape, there are no poses, a sensor follows an unknown marker, or the
-    arm cannot show an effect.
+    Returns the session, with no more in it than a recorded one, and its truth. Raises
+    InputError if solutions have a wrong shape, there are no poses or sensors, a sensor follows
+    an unknown marker, or the arm cannot show an effect.
     """
     for name, sensor in sensors.items():
         for marker in sensor.markers:

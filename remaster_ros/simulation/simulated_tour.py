@@ -25,7 +25,7 @@ def plan_tour(
     *,
     without_meshes: bool = True,
 ) -> Tour:
-    """Tour of poses that face one sensor and are visible to all, for every split with a count.
+    """Plan a tour of poses that face one sensor and are visible to all, for every split.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def plan_tour(
     places
         T_R_N of every sensor that has to see its marker, (4, 4); None for the cell's rough places.
     counts
-        Split -> number of candidate poses.
+        Split -> number of candidate poses; a split with 0 is left out.
     rng
         Source of randomness.
     without_meshes
@@ -44,7 +44,8 @@ def plan_tour(
     Raises
     ------
     InputError
-        If the inverse kinematics of this robot cannot be solved, or it can reach no pose to fit.
+        If the inverse kinematics of this robot cannot be solved, or no pose to fit is asked for or
+        can be reached.
     """
     if not counts.get('optimization'):
         raise InputError('no pose to fit is asked for; give at least one')
@@ -67,11 +68,11 @@ def plan_tour(
 
 
 def visit(tour: Tour, chain: SerialChain) -> dict[str, list[FloatArray]]:
-    """Joint solutions, (m, k) per pose, of each split in the order of the visits.
+    """Joint solutions, rad or m, (m, k) per pose, of each split in the order of the visits.
 
-    Keys are 'optimization' and 'validation', [] without poses. A simulated session begins at the
-    position within the limits nearest to zero and goes from one split to the other, each nearest
-    first.
+    Keys are 'optimization' and 'validation', [] without poses. A simulated session begins at
+    the position within the limits nearest to zero and goes from one split to the other, each
+    time to the nearest pose.
     """
     visits: dict[str, list[FloatArray]] = {'optimization': [], 'validation': []}
     q = np.clip(np.zeros(len(chain)), chain.lower, chain.upper)

@@ -161,7 +161,8 @@ def choose_robot(
     """Chain of the cell's robot, or of another robot that replaces it in the cell.
 
     ``robot``: name of a shipped URDF or path of a file, None for the cell's; ``base_link,
-    tip_link``: None for those of the cell. Changes the cell. Raises InputError if there is no such
+    tip_link``: None for those of the cell. The cell is changed in place: its robot, and its
+    held joint if the new robot lacks it or needs none. Raises InputError if there is no such
     robot, or its URDF is invalid.
     """
     if robot is not None:
@@ -186,9 +187,10 @@ def choose_robot(
 
 
 def choose_sensors(cell: Workcell, chosen: tuple[str, ...] | None) -> None:
-    """Reduce the cell to the chosen sensors, in place; if need be, poses face the first of them.
+    """Reduce the cell to the chosen sensors (names, at least one), in place; None leaves all.
 
-    None leaves all. Raises InputError if the cell has no such sensor.
+    If ``aim_at``, the sensor that poses face, is not chosen, they face the first one chosen.
+    Raises InputError if the cell has no such sensor; then nothing is changed.
     """
     if chosen is None:
         return

@@ -37,14 +37,14 @@ class Warming:
     start_s: float = 0.0
 
     def at(self, t: FloatArray) -> FloatArray:
-        """Temperature above that of the beginning, K, at times t, s; 0 before it."""
+        """Temperature above that at ``start_s``, K, at times t, s; 0 before it."""
         since = np.maximum(np.asarray(t, float) - self.start_s, 0.0)
         return self.kelvin * (1.0 - np.exp(-since / self.time_s))
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSensor:
-    """True place and errors of a sensor."""
+    """True pose, markers and noise of a simulated sensor."""
 
     marker: str  # Name of the measured marker
     T_R_N: FloatArray  # True frame of the sensor in the robot base, (4, 4)
@@ -76,13 +76,13 @@ class SimulatedSensor:
         return (self.marker, *self.further)
 
     def in_sensor(self, points_R: FloatArray) -> FloatArray:
-        """Points (..., 3) of the robot base in the sensor's frame N, m."""
+        """Convert points (..., 3) from the robot base frame R to the sensor's frame N, m."""
         return (points_R - self.T_R_N[:3, 3]) @ self.T_R_N[:3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class SessionTruth:
-    """Truth of a session: every quantity that an estimate of it is to find."""
+    """True values behind a session: offsets, markers, sensors, effects and outliers."""
 
     joint_offsets: FloatArray  # True joint angle minus reported one, rad (m: slides), (k,)
     markers: Mapping[str, FloatArray]  # True positions in the tool frame, m, name -> (3,)
@@ -101,8 +101,8 @@ class SessionTruth:
     ) -> FloatArray:
         """Positions of a marker in a sensor's frame N without noise and effects, m, (..., 3).
 
-        ``sensor``: name of the sensor; ``q``: reported joint angles, rad, (..., k); ``marker``:
-        one of its markers, '' for the first.
+        True offsets, marker and sensor pose count. ``sensor``: name of the sensor; ``q``:
+        reported joint angles, rad, (..., k); ``marker``: name, '' for the sensor's first.
         """
         true_sensor = self.sensors[sensor]
         points_R = chain.positions(
@@ -114,10 +114,10 @@ class SessionTruth:
 def place_sensor(
     place: ArrayLike, look_at: ArrayLike, std_m: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Random T_R_N (4, 4) of a sensor near a place, with its z axis towards a point of R.
+    """Random pose T_R_N (4, 4) of a sensor near a place, whose z axis points at ``look_at``.
 
-    ``place, look_at``: m, in R; ``std_m``: standard deviation of the place per axis. The roll
-    about z is uniform within 0.2 rad.
+    ``place, look_at``: in the robot base frame R, m, (3,); ``std_m``: standard deviation of
+    the place per axis. The roll about z is uniform within ±0.2 rad.
     """
     position = np.asarray(place, float) + rng.normal(0.0, std_m, 3)
     turn = looking_at(position, look_at, rng.uniform(-ROLL_RAD, ROLL_RAD))
@@ -125,9 +125,9 @@ def place_sensor(
 
 
 def mount_body(rng: np.random.Generator) -> FloatArray:
-    """Random R_T_B (3, 3) of a camera, board or probe.
+    """Random rotation R_T_B (3, 3) of a camera, board or probe on the tool.
 
-    It looks along the tool's z axis within 0.2 rad, at any roll.
+    Roll and pitch, about the tool's x and y, are within ±0.2 rad; any yaw, about its z.
     """
     tilt = rng.uniform(-ROLL_RAD, ROLL_RAD, 2)
     return matrix_from_rpy((*tilt, rng.uniform(-np.pi, np.pi)))

@@ -45,7 +45,7 @@ MOTION_FILE = 'motion.jsonl'
 
 @dataclass(frozen=True, eq=False)
 class WorldContent:
-    """Content of a World's file."""
+    """Content of a World's file: truth, arm, seed, rate and dynamics."""
 
     truth: SessionTruth  # True arm, markers and sensors
     seed: int  # Seed of everything random
@@ -60,11 +60,11 @@ class WorldContent:
 
 
 class World:
-    """True arm in front of the true sensors.
+    """Simulated truth for all fake devices: the true arm in front of the true sensors, and time.
 
-    Made by `create` (the demo) or `open` (a fake); see the module's docstring. A fake sensor uses
-    only `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`, `camera`,
-    `warming_k`, `is_moving` and `joint_speed`, so that its tests need no arm.
+    Made by `create` (the demo) or `open` (a fake); see the module's docstring. A fake sensor
+    uses only `now`, `sleep_until`, `kept_up`, `faults`, `marker_in_sensor`, `line_of_sight`,
+    `camera`, `warming_k`, `is_moving` and `joint_speed`, so that its tests need no arm.
     """
 
     def __init__(self, folder: Path, content: WorldContent) -> None:
@@ -89,7 +89,10 @@ class World:
 
     @classmethod
     def create(cls, folder: Path, content: WorldContent) -> World:
-        """New World, written into `folder`, in place of any World there."""
+        """Make a new World and write it into `folder`, in place of any World there.
+
+        The folder is made if missing. World time begins at `START_S`.
+        """
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         (folder / MOTION_FILE).write_text('')
         WorldClock.create(folder, START_S, time.monotonic())
@@ -99,7 +102,7 @@ class World:
 
     @classmethod
     def open(cls, folder: Path) -> World:
-        """World that another process wrote; raises InputError if there is none."""
+        """Read the World that another process wrote into `folder`; InputError if there is none."""
         try:
             text = (folder / WORLD_FILE).read_text()
         except OSError as error:
@@ -159,7 +162,10 @@ class World:
         return (self.folder / MOTION_FILE).stat().st_size > 0
 
     def _read_motions(self) -> None:
-        """Read the trajectories added to the file since the last call; half a line waits."""
+        """Read the trajectories added to the file since the last call; the arm follows them.
+
+        An incomplete last line is kept until its rest is there.
+        """
         if self._lines is None:
             self._lines = (self.folder / MOTION_FILE).open()
             self._lines.seek(self._position)
@@ -176,20 +182,26 @@ class World:
                 self._motion.follow(start_s, waypoints, reference)
 
     def reported(self, t: float) -> tuple[FloatArray, FloatArray]:
-        """Joint positions (rad or m) and velocities (per s) by the encoders at time t, (k,)."""
+        """Joint positions (rad or m) and velocities (per s) by the encoders at time t, (k,) each.
+
+        Without noise and lag.
+        """
         with self._lock:
             self._read_motions()
             return self._motion.at(t)
 
     def encoders(self, t: float) -> FloatArray:
-        """Joint positions that a report of time t has, each late by its joint's lag, (k,)."""
+        """Joint positions in a report of world time t, s, each late by its joint's lag, (k,)."""
         if self.dynamics is None:
             return self.reported(t)[0]
         late = t - self.dynamics.lag_s
         return np.array([self.reported(at)[0][joint] for joint, at in enumerate(late.tolist())])
 
     def camera(self, sensor: str) -> CameraTiming | None:
-        """Times of a camera's frames; None if a frame is sent at the time that it shows."""
+        """Timing of the camera of a sensor; None if a frame is sent at the time that it shows.
+
+        So without dynamics, and for an unknown sensor.
+        """
         return None if self.dynamics is None else self.dynamics.cameras.get(sensor)
 
     def joint_speed(self, t: float) -> float:
@@ -237,10 +249,11 @@ class World:
         return float(self.truth.warming.at(np.array(t)))
 
     def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
-        """Whether the sensor sees a marker, '' for the first, at time t, with no link between.
+        """Whether the sensor sees a marker, '' for the first, at world time t, s.
 
-        False also beyond the sensor's acceptance angle from the tool's z axis, and with the faults
-        ``occluded`` and ``intermittent``. Raises InputError for an unknown sensor.
+        False if a link is between them, beyond the sensor's acceptance angle from the tool's z
+        axis, and with the faults ``occluded`` and ``intermittent``. Raises InputError for an
+        unknown sensor.
         """
         true_sensor, faults = self._sensor(sensor), self.faults(sensor)
         if 'occluded' in faults or in_outage(faults.get('intermittent'), t):

@@ -32,9 +32,10 @@ _VERSION, _LINE, _SLOT = struct.Struct('=Q'), struct.Struct('=dddd'), struct.Str
 
 
 class WorldClock:
-    """Clock of a World, see the module's docstring.
+    """Clock of a World, shared by all processes through a file; see the module's docstring.
 
-    ``folder``: folder of the World with the file by `create`; ``rate``: world time over wall time.
+    ``folder``: folder of the World with the file by `create`; ``rate``: world time over wall
+    time.
     """
 
     def __init__(self, folder: Path, rate: float) -> None:
@@ -44,7 +45,7 @@ class WorldClock:
 
     @staticmethod
     def create(folder: Path, start_s: float, started_wall_s: float) -> None:
-        """Write the file: world time was `start_s` at `started_wall_s` of the monotonic clock.
+        """Write the file: world time was ``start_s`` at ``started_wall_s`` of the monotonic clock.
 
         Time then runs without a limit, and without fake sensors.
         """
@@ -52,27 +53,27 @@ class WorldClock:
         (folder / CLOCK_FILE).write_bytes(_VERSION.pack(0) + 2 * line + bytes(SLOTS * _SLOT.size))
 
     def now(self, wall_s: float | None = None) -> float:
-        """World time now, or at `wall_s` of the monotonic clock, s."""
+        """World time, s, now or at ``wall_s`` of the monotonic clock; at most the valid limit."""
         base_wall, base, limit, held_until = self._line()
         wall = time.monotonic() if wall_s is None else wall_s
         world_s = min(base + (min(wall, held_until) - base_wall) * self.rate, limit)
         return world_s + max(wall - held_until, 0.0) * self.rate
 
     def sleep_until(self, t: float) -> None:
-        """Wait until world time t.
+        """Wait until world time t, s; returns at once if it has passed.
 
-        The argument is a time, not a duration: a process delayed before the wait would otherwise
-        wait for a time after the limit, and the limit waits for the process.
+        The argument is a time, not a duration: a process delayed before the wait would
+        otherwise wait for a time after the limit, and the limit waits for the process.
         """
         while (remaining := t - self.now()) > 0.0:
             # If world time has stopped, the remaining time does not decrease.
             time.sleep(max(remaining / self.rate, POLL_WALL_S))
 
     def hold(self, limit_s: float) -> None:
-        """Set the limit of world time to `limit_s`, but not below now, until the next call.
+        """Set the limit of world time to ``limit_s``, but not before now, until the next call.
 
-        For one process only, the owner of the clock. Without another call the limit is void after
-        3 s (`HELD_WALL_S`).
+        For one process only, the owner of the clock. Without another call the limit is void
+        after 3 s of wall time (`HELD_WALL_S`).
         """
         wall = time.monotonic()
         now = self.now(wall)
@@ -84,21 +85,22 @@ class WorldClock:
         _VERSION.pack_into(self._memory, 0, version + 1)
 
     def kept_up(self, slot: int, now_s: float) -> None:
-        """Record that this process, a fake sensor, has done everything due until `now_s`.
+        """Record that this process, a fake sensor, has done everything due until ``now_s``.
 
-        ``slot``: number of the sensor, 0 to 15.
+        ``now_s``: world time, s; ``slot``: number of the sensor, 0 to 15.
         """
         _SLOT.pack_into(self._memory, _slot_at(slot), os.getpid(), now_s)
 
     def slots(self) -> dict[int, tuple[int, float]]:
-        """Slot -> (process id, world time of its progress, s) of each fake sensor in use."""
+        """Fake sensors in use: slot -> (process id, world time until which it has done all, s)."""
         found = {i: _SLOT.unpack_from(self._memory, _slot_at(i)) for i in range(SLOTS)}
         return {slot: (pid, done_s) for slot, (pid, done_s) in found.items() if pid}
 
     def _line(self) -> tuple[float, float, float, float]:
-        """Last written line: wall and world time of its start, limit, end of the hold, s.
+        """Last line of the clock's file, from which world time is computed.
 
-        Read again if a writer came in between.
+        Wall time and world time of its writing, limit, and wall time until which the limit is
+        valid, s. Read again if a writer came in between.
         """
         while True:
             (version,) = _VERSION.unpack_from(self._memory)
@@ -108,17 +110,17 @@ class WorldClock:
 
 
 def _line_at(version: int) -> int:
-    """Place in the clock's file of the line of a version: two lines in turn."""
+    """Byte offset in the clock's file of the line of a version; two places are used in turn."""
     return _VERSION.size + version % 2 * _LINE.size
 
 
 def _slot_at(slot: int) -> int:
-    """Place in the clock's file of a fake sensor's slot, from 0."""
+    """Byte offset in the clock's file of a fake sensor's slot; ``slot`` counts from 0."""
     return _line_at(1) + _LINE.size + slot * _SLOT.size
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process of this machine is alive and not paused (SIGSTOP)."""
+    """Whether a process of this machine is alive and not stopped (SIGSTOP) or a zombie."""
     try:
         text = Path(f'/proc/{pid}/stat').read_text()
     except OSError:

@@ -30,7 +30,7 @@ from remaster_ros.types import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """State of the arm at n configurations, in the base frame R."""
+    """Joint origins, frames and axes, and the tool, at n configurations, in the base frame R."""
 
     origin: FloatArray  # Origin of every joint, before its own motion, m, (n, k, 3)
     # Rotation of each joint's frame before and after the joint's own, (n, k, 3, 3)
@@ -49,7 +49,10 @@ class Arm(Protocol):
     slides: BoolArray  # Whether each joint slides, (k,)
 
     def state(self, q: FloatArray) -> ArmState:
-        """State of every joint for true joint positions q, rad or m, (n, k)."""
+        """Origins, frames and axes of all joints, and the tool, at true positions q (n, k).
+
+        In the robot base frame R. ``q``: rad or m.
+        """
 
     def gravity_torque(self, q: FloatArray) -> FloatArray:
         """Gravity's torque about each joint, in its positive direction, N m, (n, k).
@@ -58,21 +61,27 @@ class Arm(Protocol):
         """
 
     def base_moment(self, q: FloatArray) -> FloatArray:
-        """Moment of the moving links' weight about the base's origin, N m, (n, 3)."""
+        """Torque of the moving links' weight about the origin of the base, N m, (n, 3).
+
+        In the robot base frame R. ``q``: true positions, rad or m, (n, k).
+        """
 
     def carried_moment(self, q: FloatArray) -> FloatArray:
-        """Gravity's moment on what each joint carries about its origin, in R, N m, (n, k, 3)."""
+        """Gravity's torque on all links behind each joint about its origin, N m, (n, k, 3).
+
+        In the robot base frame R. ``q``: true positions, rad or m, (n, k).
+        """
 
     def segments(self) -> FloatArray:
-        """Vector from each joint to the next, from the last to the tool, m, (k + 1, 3).
+        """Vectors from the base to joint 1, from joint to joint, and to the tool, m, (k + 1, 3).
 
-        Segment j is fixed in the frame after joint j; segment 0, before joint 1, in the base.
+        As drawn. Row j is in the frame after joint j, row 0 in that of the base.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Round:
-    """Visited configurations in their order."""
+    """Configurations that the arm visits, in their order, with times and temperatures."""
 
     q: FloatArray  # Joint angles as reported by the robot, rad, (m, k)
     home: FloatArray  # Joint angles before the first visit, rad, (k,)
@@ -86,9 +95,10 @@ class Round:
 
 
 def circumstances(arm: Arm, visited: Round, joint_offsets: FloatArray) -> Circumstances:
-    """Quantities that effects may depend on, per configuration.
+    """Quantities on which hidden effects may depend, at each visited configuration.
 
-    Torques and frames are those of the true joint angles. A joint's approach is 0 until it moves.
+    Torques and frames are those of the reported angles plus ``joint_offsets``, rad or m, (k,).
+    A joint's approach (direction of its last move) is 0 until it moves.
     """
     q, per_radian = visited.q + joint_offsets, np.where(arm.slides, SLIDE_M, 1.0)
     move = visited.q - visited.previous_q
@@ -120,9 +130,9 @@ def deviation(
     sensors: tuple[str, ...],
     markers: tuple[str, ...],
 ) -> Deviation:
-    """Deviation by all effects together, with sensors and markers of these names.
+    """Deviation of arm and sensors by all effects together, at n configurations.
 
-    Zero without effects.
+    ``c``: what they depend on; ``sensors, markers``: names. Zero without effects.
     """
     n, k = c.q.shape
     total = Deviation.none(n, k, sensors, markers)
@@ -132,11 +142,13 @@ def deviation(
 
 
 def placed(state: ArmState, marker: FloatArray, wrong: Deviation | None) -> FloatArray:
-    """Positions of a marker of the tool frame (3,) or (n, 3) in R, m, (n, 3).
+    """Positions of a point given in the tool frame, with deviations of the arm, m, (n, 3).
 
-    Small motions within the chain are exact: T₁D₁T₂D₂p = (A₁D₁A₁⁻¹)(A₂D₂A₂⁻¹)A₂p with A₂ = T₁T₂,
-    so each moves the part of the arm behind it, the outermost first, in the frames of the chain as
-    drawn.
+    In the robot base frame R. ``marker``: the point, m, (3,) or (n, 3); ``wrong``: deviations
+    but for those of the joint angles, which ``state`` has already; None for none. Small
+    motions within the chain are exact: T₁D₁T₂D₂p = (A₁D₁A₁⁻¹)(A₂D₂A₂⁻¹)A₂p with A₂ = T₁T₂, so
+    each moves the part of the arm behind it, the outermost first, in the frames of the chain
+    as drawn.
     """
     markers = np.broadcast_to(marker, state.tool_origin.shape)
     point = state.tool_origin + np.einsum('nij,nj->ni', state.tool, markers)
@@ -158,10 +170,10 @@ def measured(
     position: FloatArray,
     wrong: Deviation | None,
 ) -> FloatArray:
-    """Readings of a marker by a sensor, in the sensor's frame N, m, (n, 3).
+    """Readings, without noise, of a marker by a sensor in its frame N, m, (n, 3).
 
-    ``name``: of the sensor; ``marker``: name of the marker; ``position``: in the tool frame, m,
-    (3,); ``wrong``: deviation of arm and sensors, None without effects.
+    ``name``: of the sensor; ``marker``: name of the marker; ``position``: in the tool frame,
+    m, (3,); ``wrong``: deviation of arm and sensors, None without effects.
     """
     if wrong is None:
         return sensor.in_sensor(placed(state, position, None))
@@ -171,7 +183,7 @@ def measured(
 
 @dataclass(eq=False)
 class WorldModel:
-    """True arm and sensors on one round of visits."""
+    """True arm and sensors on one round of visits, and the readings with hidden effects."""
 
     arm: Arm  # Arm as drawn
     visited: Round
@@ -182,7 +194,7 @@ class WorldModel:
 
     @cached_property
     def circumstances(self) -> Circumstances:
-        """Quantities that effects may depend on, per configuration."""
+        """Quantities on which effects may depend, at each visited configuration."""
         return circumstances(self.arm, self.visited, self.joint_offsets)
 
     def seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
@@ -213,7 +225,10 @@ class WorldModel:
         return np.asarray(turn.reshape(seen.shape) @ seen)
 
     def _true_state(self, effects: Sequence[HiddenEffect]) -> tuple[ArmState, Deviation | None]:
-        """True state of the arm, and the deviation of arm and sensors; None without effects."""
+        """State of the arm at the true angles of all visits, and the deviation by effects.
+
+        The deviation is None without effects.
+        """
         q = self.visited.q + self.joint_offsets
         if not effects:
             return self.arm.state(q), None
@@ -233,7 +248,7 @@ class WorldModel:
         }
 
     def response(self, effect: HiddenEffect) -> FloatArray:
-        """Change of the readings by an effect alone, m, (n, 3), in the rows of `seen`."""
+        """Change of the sensors' readings by one effect alone, m, (n, 3), rows as of `seen`."""
         return self.seen([effect]) - self._as_drawn
 
     @cached_property
@@ -243,9 +258,10 @@ class WorldModel:
 
     @cached_property
     def nuisance(self) -> FloatArray:
-        """Derivatives of the readings by offsets, registrations, markers: m, (n, 3, p).
+        """Derivatives of the readings by what a fit estimates, m per rad or m, (n, 3, p).
 
-        Offsets first (k), then six per sensor, last three per marker.
+        Parameters: joint offsets (k), then shift and rotation of each sensor (6), then the
+        position of each marker (3). Rows as of `seen`.
         """
         state = self.arm.state(self.visited.q + self.joint_offsets)
         blocks = []
@@ -269,9 +285,10 @@ class WorldModel:
         return np.stack(blocks, axis=1).reshape(-1, 3, blocks[0].shape[2])
 
     def left(self, response: FloatArray, *, fit_markers: bool = True) -> FloatArray:
-        """Part of a response (n, 3) that remains after the fit, m, (n, 3).
+        """Part of a change of the readings that remains after a fit, m, (n, 3).
 
-        The fit absorbs changes of registration and offsets, and of markers if ``fit_markers``.
+        ``response``: the change, m, (n, 3). The linear fit absorbs changes of sensor poses and
+        joint offsets, and of markers if ``fit_markers``.
         """
         basis = self._basis if fit_markers else self._basis_without_markers
         flat = response.ravel()
@@ -279,7 +296,7 @@ class WorldModel:
 
     @cached_property
     def _basis(self) -> FloatArray:
-        """Orthonormal basis of what the fit absorbs, (3 n, rank)."""
+        """Orthonormal basis of what a fit with free markers absorbs, (3 n, rank)."""
         return _span(self.nuisance.reshape(-1, self.nuisance.shape[2]))
 
     @cached_property
@@ -289,22 +306,25 @@ class WorldModel:
         return _span(fixed.reshape(-1, fixed.shape[2]))
 
     def size_m(self, effect: HiddenEffect) -> float:
-        """Size of an effect: RMS of the 3-D error over all rows that remains after the fit, m.
+        """Size of an effect: RMS length, m, of what remains of it in all rows after the fit.
 
-        A wrong marker is compared with a marker fixed at its nominal position: a fitted marker
-        would absorb it.
+        The fit is that of `left`. A wrong marker is compared with a marker fixed at its
+        nominal position: a fitted marker would absorb it.
         """
         remainder = self.left(self.response(effect), fit_markers=effect.kind != 'marker_offset')
         return float(np.sqrt(np.mean(np.sum(remainder**2, axis=1))))
 
     def of_size(self, effect: HiddenEffect, size_m: float) -> HiddenEffect:
-        """Effect scaled so that `size_m` gives this size, m, up to its small nonlinearity."""
+        """Return an effect scaled so that `size_m`, the method, gives the size ``size_m``, m.
+
+        Nearly: three steps for what is not linear.
+        """
         for _ in range(3):  # all but linear
             effect = effect.scaled(size_m / self.size_m(effect))
         return effect
 
 
 def _span(design: FloatArray) -> FloatArray:
-    """Orthonormal basis of the column space of a design, (3 n, rank)."""
+    """Orthonormal basis of the column space of a matrix (3 n, p), (3 n, rank)."""
     basis, singular, _ = np.linalg.svd(design, full_matrices=False)
     return basis[:, singular > 1e-9 * singular[0]]

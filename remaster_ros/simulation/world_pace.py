@@ -37,7 +37,7 @@ LOOK_WALL_S = 0.1
 
 @dataclass
 class _Participant:
-    """Progress of a process: in world time, and the wall time of its last sign."""
+    """Progress of a process in world time, s, and wall time of its last sign, s."""
 
     done_s: float
     came_wall: float
@@ -46,11 +46,11 @@ class _Participant:
 
 
 class Pace:
-    """Participants of a World, and the limit of its time that follows from their progress.
+    """Limit of world time by the progress of the processes that take part in a World.
 
     The process with this object owns the clock. Progress is confirmed no more often than every
-    ``confirmed_every_s``, s: the last reports before a silence may never be confirmed, and count
-    as received.
+    ``confirmed_every_s``, s: the last reports before a silence may never be confirmed, and
+    count as received.
     """
 
     def __init__(self, clock: WorldClock, confirmed_every_s: float = 0.0) -> None:
@@ -67,16 +67,16 @@ class Pace:
         self._fakes: dict[int, _Participant] = {}
 
     def published(self, stamp_s: float) -> None:
-        """Record that a report with this stamp, s, is published now."""
+        """Record that a report of joint states with this stamp, s, is published now."""
         with self._lock:
             self._reports.append((stamp_s, self._clock.now()))
 
     def took(self, pid: int, stamp_s: float, *, leads: bool = False) -> None:
         """Record that a process has received all reports up to the one with this stamp, s.
 
-        If no report has the stamp, it is a world time until which the process has done everything.
-        A process that ``leads`` the arm confirms each report after the command that it has sent.
-        Progress never decreases.
+        ``pid``: its process id. If no report has the stamp, it is a world time until which the
+        process has done everything. A process that ``leads`` the arm confirms each report
+        after the command that it has sent. Progress never decreases.
         """
         with self._lock:
             now = self._clock.now()
@@ -111,7 +111,7 @@ class Pace:
         self._clock.hold(min(not_led_s + LEAD_AHEAD_S, slowest_s + self._ahead_s, most_s))
 
     def _first_after(self, done_s: float) -> float:
-        """World time of the publication of the first report after a progress, s; else infinity."""
+        """World time, s, of the first publication of a report after ``done_s``; else infinity."""
         return next(
             (published_s for _, published_s in self._reports if published_s > done_s), math.inf
         )
@@ -120,10 +120,10 @@ class Pace:
 def _progress_of_running(
     participants: dict[int, _Participant], wall: float, patience_s: float = PATIENCE_WALL_S
 ) -> Iterable[float]:
-    """World time, s, of the progress of each running process with a sign within the patience.
+    """Yield the world time, s, until which each running process has done everything.
 
-    ``wall``: present time of the monotonic clock, s. Whether a process runs is looked up every 0.1
-    s.
+    Left out are processes without a sign for over ``patience_s`` of wall time. ``wall``:
+    present time of the monotonic clock, s. Whether a process runs is looked up every 0.1 s.
     """
     for pid, p in participants.items():
         if wall - p.looked_wall > LOOK_WALL_S:

@@ -12,7 +12,10 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = b_j sign(q_j - from_q_j)."""
+    """Yield a candidate for each joint that moved: δq_j = b_j sign(q_j - from_q_j).
+
+    The parameter b_j is half the play, rad or m. The sign is that of the joint's last move.
+    """
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -23,6 +26,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _play(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the play of a joint: how far apart it stops coming from its two sides.
+
+    ``draws``: of half the play, rad or m, (draws, 1).
+    """
     joint = candidate.joints[0]
     return f'joint {joint} stops {of_joint(context, joint, 2.0 * draws[:, 0])} apart, side by side'
 

@@ -40,7 +40,10 @@ NO_TIMES = 'the session has no times (times: none), only the order of its rows'
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Displacements, or added joint positions, in n rows by one unit of each of m parameters."""
+    """Columns of a candidate: effect of one unit of each of its m parameters in n rows.
+
+    Either positions added to one joint (`at`), or displacements of the marker.
+    """
 
     at: int | None  # Index of the joint whose angle it adds to; None if it displaces the marker
     # Added joint angle, rad or m per unit, (n, m), or displacement in R, m per unit, (n, 3, m)
@@ -52,7 +55,10 @@ class Design:
         return self.values.shape[-1]
 
     def displacement(self, context: Context) -> FloatArray:
-        """Return the displacement of the marker in R to first order, m per unit, (n, 3, m)."""
+        """Return the displacement of the marker, m per unit in the base frame R, (n, 3, m).
+
+        To first order: of positions added to a joint by the marker's Jacobian in ``context``.
+        """
         if self.at is None:
             return self.values
         return context.jacobian[:, :, self.at, None] * self.values[:, None, :]
@@ -69,7 +75,11 @@ class ModelChange:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One candidate cause: a place, a driver and a form, with its parameters."""
+    """Candidate cause of errors: what errs, the quantity it depends on, and the function of it.
+
+    ``place`` is what errs (such as a joint's angle or a sensor's frame), ``driver`` the quantity
+    that the error depends on, ``form`` the kind of function.
+    """
 
     name: str  # Of the named effect; 'unnamed' for the rest
     # As discovery.json has them
@@ -118,7 +128,7 @@ class Candidate:
 
     @property
     def happened(self) -> bool:
-        """Whether the error began at one moment and stayed, as a step."""
+        """Whether the error begins, ends or changes at one moment of the session (`moment`)."""
         return not np.isnan(self.moment)
 
     @property
@@ -133,7 +143,11 @@ class Candidate:
         )
 
     def is_shape_of(self, form: Candidate) -> bool:
-        """Return whether this candidate is one shape among those of a free form."""
+        """Return whether this candidate is one fixed shape among those of a free form (a spline).
+
+        True if ``form`` has a penalty, this candidate has none, and place, driver, joints and
+        subject are the same.
+        """
         return (
             form.penalty is not None
             and self.penalty is None
@@ -154,14 +168,20 @@ class Candidate:
 
     @cached_property
     def label(self) -> str:
-        """Text of subject, variant and moment, of those that the candidate has."""
+        """Text of subject, variant and moment, joined by blanks: 'mocap shift 812.000 s'.
+
+        Parts that the candidate lacks are left out; '' if it has none of them.
+        """
         moment = '' if np.isnan(self.moment) else f'{self.moment:.3f} s'
         moment = f'until {moment}' if self.ends else moment
         return ' '.join(part for part in (self.subject, self.variant, moment) if part)
 
 
 class Changes(Protocol):
-    """Columns of a candidate that is present only after, or before, a moment in a gap."""
+    """Function that makes the columns of a candidate that begins, ends or changes in a gap.
+
+    ``gap``: start and end, s since the first row, (2,), between which the moment lies.
+    """
 
     def __call__(
         self, context: Context, candidate: Candidate, gap: FloatArray, ends: bool
@@ -172,7 +192,7 @@ class Changes(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """A physical cause with a name: everything that the program needs to find and explain it."""
+    """Named physical cause: makes its candidates, and has the texts that explain them."""
 
     name: str  # As in discovery.json
     # Of its candidates
@@ -228,20 +248,30 @@ class Effect:
     def candidate(
         self, columns: Callable[[Context], Design], parameters: Iterable[str], **more: Any
     ) -> Candidate:
-        """Return a candidate of this effect; ``more`` are further arguments of `Candidate`."""
+        """Return a candidate of this effect.
+
+        Name, place, driver, form, unit, sign and prior size are the effect's, unless given in
+        ``more``: further arguments of `Candidate`.
+        """
         names = ('name', 'place', 'driver', 'form', 'unit', 'sign')
         defaults = {name: getattr(self, name) for name in names}
         defaults['largest'] = self.plausible[1] if self.plausible else None
         return Candidate(columns=columns, parameters=tuple(parameters), **{**defaults, **more})
 
     def sentence_of(self, candidates: Iterable[Candidate]) -> str:
-        """Return the sentence about candidates of the effect; another one if all joints slide."""
+        """Return the sentence for candidates of this effect, with its placeholders not filled in.
+
+        `slide_sentence`, if there is one, if all candidates are about joints that slide.
+        """
         return (
             all(candidate.slide for candidate in candidates) and self.slide_sentence
         ) or self.sentence
 
     def remedy_of(self, candidate: Candidate) -> str:
-        """Return the remedy for a candidate of this effect."""
+        """Return the remedy for a candidate of this effect, with its driver filled in.
+
+        `slide_remedy`, if there is one, if the candidate is about a joint that slides.
+        """
         remedy = (candidate.slide and self.slide_remedy) or self.remedy
         return remedy.format(driver=candidate.driver.replace('_', ' '))
 
@@ -253,11 +283,12 @@ class Effect:
         parameters: Sequence[str],
         **more: Any,
     ) -> Iterator[Candidate]:
-        """Yield a candidate for each of some joints (1-based), which adds to that joint's angle.
+        """Yield a candidate for each of some joints (1-based), which adds to its position.
 
-        ``joints``: which of the context's; ``features``: context and joint to m added angles, rad
-        or m per unit, (n,) each; ``parameters``: names of the m parameters, with ``{joint}`` for
-        the joint; ``more``: further arguments of `Candidate`.
+        ``joints``: which of the context's; ``features``: function of context and joint to m
+        added positions, rad or m per unit, (n,) each; ``parameters``: names of the m
+        parameters, with ``{joint}`` for the joint; ``more``: further arguments of `Candidate`.
+        For a joint that slides unit, driver and prior size are those of a slide.
         """
         for joint in joints:
             slide_fields: dict[str, Any] = {}
@@ -278,44 +309,65 @@ class Effect:
 def _added(
     context: Context, joint: int, features: Callable[[Context, int], Sequence[FloatArray]]
 ) -> Design:
+    """Return columns that add features to a joint's position, rad or m per unit, (n, m).
+
+    ``joint``: 1-based; ``features``: function of context and joint to m arrays, (n,) each.
+    """
     return Design(joint - 1, np.stack(features(context, joint), axis=-1))
 
 
 def displaced(*shifts: FloatArray) -> Design:
-    """Return columns that displace the marker by shifts (n, 3) in R, m per unit."""
+    """Return columns that displace the marker by m shifts in base frame R, (n, 3), m per unit."""
     return Design(None, np.stack(shifts, axis=-1))
 
 
 def along_axes(features: FloatArray, turns: FloatArray) -> list[FloatArray]:
-    """Return each feature (n, m) times each axis of rotations (n, 3, 3): 3 m shifts (n, 3).
+    """Return each of m features times each axis of a frame: 3 m shifts, (n, 3) each.
 
-    The three axes of a feature stand next to each other.
+    ``features``: (n, m); ``turns``: rotation matrices of the frame, (n, 3, 3), or (1, 3, 3)
+    for all rows. The three axes of a feature stand next to each other.
     """
     return [features[:, [i]] * turns[:, :, a] for i in range(features.shape[1]) for a in range(3)]
 
 
 def turned(context: Context, axes: Sequence[FloatArray], about: FloatArray) -> Design:
-    """Return columns that turn the marker about points (n, 3), m, by axes (n, 3), rad per unit."""
+    """Return columns of small rotations of the marker about axes through points.
+
+    ``axes``: rotation vectors in the base frame R, rad per unit, (n, 3) each, one for each
+    parameter; ``about``: points of R on the axes, m, (n, 3) or (3,).
+    """
     return displaced(*(np.cross(axis, context.points - about) for axis in axes))
 
 
 def needs_gravity(context: Context) -> str:
-    """Return why gravity's effects cannot be tested; '' if they can."""
+    """Return the reason why effects of gravity cannot be tested; '' if they can.
+
+    They cannot if the URDF has no link masses.
+    """
     return '' if context.has_gravity else 'the URDF has no link masses, so gravity is unknown'
 
 
 def needs_approach(context: Context) -> str:
-    """Return why approach and last move cannot be tested; '' if they can."""
+    """Return the reason why effects of approach and last move cannot be tested; '' if they can.
+
+    They cannot if ``from_q`` is unknown in too many rows.
+    """
     return '' if context.has_approach else 'where the arm came from (from_q) is not recorded'
 
 
 def needs_motion(context: Context) -> str:
-    """Return why effects of motion cannot be tested; '' if they can."""
+    """Return the reason why effects of motion cannot be tested; '' if they can.
+
+    They cannot if the arm stood still at every reading.
+    """
     return '' if context.has_motion else 'the arm stood still at every reading'
 
 
 def needs_time(context: Context) -> str:
-    """Return why drift cannot be tested; '' if it can."""
+    """Return the reason why effects over time cannot be tested; '' if they can.
+
+    They cannot without times, or if all rows have the same time.
+    """
     if context.has_time:
         return ''
     return 'all rows have the same time' if context.timed else NO_TIMES

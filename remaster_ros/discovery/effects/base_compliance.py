@@ -15,7 +15,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One compliance for all directions, or one about each horizontal axis."""
+    """Yield two candidates: one compliance for all directions; one each about axes x and y."""
     x, y, z = np.eye(3)
     for variant, axes, parameters in (
         ('isotropic', [x + y + z], ['base_compliance']),
@@ -27,11 +27,18 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _tipped(context: Context, axes: list[FloatArray]) -> Design:
+    """Return columns of a base that turns in proportion to gravity's torque, rad/(N m).
+
+    One column for each of ``axes``, (3,): the torque's components are multiplied by it.
+    """
     return turned(context, [context.base_moment * axis for axis in axes], np.zeros(3))
 
 
 def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the largest tip of the base under the arm's weight, by axis."""
+    """Phrase for the angle by which the base tips under the largest torque of the arm's weight.
+
+    ``draws``: of the compliance, rad/(N m), (draws, 1), or about x and y, (draws, 2).
+    """
     moment = largest(np.linalg.norm(context.base_moment, axis=1))
     about = candidate.parameters if candidate.size > 1 else ('',)
     return ' and '.join(

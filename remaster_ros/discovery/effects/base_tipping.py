@@ -22,14 +22,22 @@ FINER = np.arange(-4, 5) / 4.0
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Rocking about each of `AXES` axes, at several quantiles of the weight's moment about it."""
+    """Yield candidates of a base that rocks about an axis as a torque passes a threshold.
+
+    One for each of `AXES` horizontal axes and each of `SHARES`: the threshold, N m, is that
+    quantile of gravity's torque about the axis in the rows to fit.
+    """
     for degrees in np.arange(AXES) * (180.0 / AXES):
         for share in SHARES:
             yield _candidate(context, float(degrees), share)
 
 
 def _candidate(context: Context, degrees: float, share: float) -> Candidate:
-    """Candidate that rocks about an axis `degrees` from x, at the quantile `share` of moment."""
+    """Candidate of a base that rocks about a horizontal axis, `degrees` from x of the base frame.
+
+    The threshold of gravity's torque about the axis, N m, is its quantile `share`, from 0 to 1,
+    in the rows to fit.
+    """
     level = float(np.quantile(context.base_moment[context.to_fit] @ _axis(degrees), share))
     return EFFECT.candidate(
         Rocking(degrees, level),
@@ -40,7 +48,11 @@ def _candidate(context: Context, degrees: float, share: float) -> Candidate:
 
 
 def finer(context: Context, candidate: Candidate) -> Iterator[Candidate]:
-    """Yield candidates with axes and moments near those of a candidate."""
+    """Yield base-tipping candidates on a finer grid of axes and torque thresholds about one.
+
+    Axes are within 15 degrees of the candidate's; thresholds are quantiles within 0.1 of its
+    own. AssertionError for a candidate of another effect.
+    """
     best = candidate.columns
     assert isinstance(best, Rocking)
     share = float(np.mean(context.base_moment[context.to_fit] @ best.axis <= best.level))
@@ -51,19 +63,23 @@ def finer(context: Context, candidate: Candidate) -> Iterator[Candidate]:
 
 
 def _axis(degrees: float) -> FloatArray:
+    """Return the horizontal unit vector at an angle from x of the base frame, degrees, (3,)."""
     return np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.0])
 
 
 @dataclass(frozen=True)
 class Rocking:
-    """Columns of a base that rocks about an axis of R if its moment exceeds a level."""
+    """Function that makes the columns of a base that rocks as a torque passes a threshold.
+
+    The torque is gravity's about a horizontal axis of the base frame R.
+    """
 
     degrees: float  # Of the horizontal axis, from x of R
     level: float  # N m
 
     @property
     def axis(self) -> FloatArray:
-        """The axis, (3,)."""
+        """Unit vector of the horizontal axis in the base frame R, (3,)."""
         return _axis(self.degrees)
 
     def __call__(self, context: Context) -> Design:

@@ -12,7 +12,10 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate for each sensor, also without rows: δp = J q̇ d (t - t̄), d: drift, s/s."""
+    """Yield one candidate for each sensor, of a clock drift d, s/s: δp = J q̇ d (t - t̄).
+
+    t̄: mean time of the sensor's rows to fit, s. A sensor without rows has one too, of zeros.
+    """
     for index, name in enumerate(context.sensor_names):
         mine = context.seen_by(index) & context.to_fit
         middle = float(context.elapsed_s[mine].mean()) if mine.any() else 0.0
@@ -25,12 +28,19 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _moved_on(context: Context, sensor: int, middle: float) -> Design:
+    """Return columns of a sensor's clock drift: marker velocity by time since `middle`, m per s/s.
+
+    ``middle``: s since the first row. Rows of other sensors are 0.
+    """
     seconds = (context.elapsed_s - middle) * context.seen_by(sensor)
     return displaced(context.marker_velocity * seconds[:, None])
 
 
 def _fast(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the rate of a sensor's clock, parts in a million."""
+    """Phrase for how slow or fast a sensor's clock is, by draws of its drift, s/s, (draws, 1).
+
+    In parts in a million: "mocap's clock is 12 ± 2 parts in a million slow".
+    """
     parts = 1e6 * draws[:, 0]
     mean = float(parts.mean())
     what = 'slow' if mean >= 0.0 else 'fast'

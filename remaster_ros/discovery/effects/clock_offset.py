@@ -12,7 +12,10 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate for each sensor: δp = J q̇ c, c: delay missing in its stamps, s."""
+    """Yield one candidate for each sensor: δp = J q̇ c.
+
+    c: what has to be added to its stamps, s.
+    """
     for index, name in enumerate(context.sensor_names):
         yield EFFECT.candidate(
             partial(_moved_on, sensor=index),
@@ -23,11 +26,15 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _moved_on(context: Context, sensor: int) -> Design:
+    """Return columns of a sensor's clock offset: marker velocity, m/s; 0 for other sensors."""
     return displaced(context.marker_velocity * context.seen_by(sensor)[:, None])
 
 
 def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the delay of a sensor's stamps, ms."""
+    """Phrase for how much later or earlier a sensor's stamps are than import assumed, ms.
+
+    ``draws``: of the parameter of `candidates`, s, (draws, 1): stamps are earlier if positive.
+    """
     late = -1e3 * draws[:, 0]
     mean = float(late.mean())
     what = 'later' if mean >= 0.0 else 'earlier'

@@ -32,7 +32,7 @@ BLOCK_ROWS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Context:
-    """Measurements and fitted model on which effects may depend: n rows, k joints."""
+    """Measurements and fitted model from which effects compute their columns: n rows, k joints."""
 
     chain: SerialChain  # The nominal robot
     # All rows; ``sensor`` and ``marker`` are indices into the names below
@@ -58,37 +58,37 @@ class Context:
 
     @property
     def sensor(self) -> IntArray:
-        """Sensor index, (n,)."""
+        """Index of each row's sensor in `sensor_names`, (n,)."""
         return self.measurements.sensor
 
     @property
     def marker(self) -> IntArray:
-        """Marker index, (n,)."""
+        """Index of each row's marker in `marker_names`, (n,)."""
         return self.measurements.marker
 
     @cached_property
     def q(self) -> FloatArray:
-        """Joint positions with the zero-offsets, rad or m, (n, k)."""
+        """Joint positions with the fitted zero-offsets added, rad or m, (n, k)."""
         return self.measurements.q + self.joint_offsets
 
     @cached_property
     def frames(self) -> FloatArray:
-        """Frame after each joint in R, (n, k, 4, 4)."""
+        """Pose of the frame after each joint in the robot base frame R, (n, k, 4, 4)."""
         return self.chain.frames(self.q)
 
     @cached_property
     def tool(self) -> FloatArray:
-        """Tool frame in R, (n, 4, 4)."""
+        """Pose of the tool frame in the robot base frame R, (n, 4, 4)."""
         return self.frames[:, -1] @ self.chain.T_fixed[-1]
 
     @cached_property
     def points(self) -> FloatArray:
-        """Modelled markers in R, m, (n, 3)."""
+        """Position of each row's marker by the model, in the robot base frame R, m, (n, 3)."""
         return apply(self.tool, self.markers[self.marker])
 
     @cached_property
     def jacobian(self) -> FloatArray:
-        """Velocity of the marker by each joint, m/rad or m/m, (n, 3, k)."""
+        """Derivative of the marker's position in R by each joint, m/rad or m/m, (n, 3, k)."""
         return self.chain.position_jacobian(self.q, self.markers[self.marker])
 
     @cached_property
@@ -98,7 +98,10 @@ class Context:
 
     @cached_property
     def gravity_moment(self) -> FloatArray:
-        """Gravity's moment about each joint of all links it carries, N m, (n, k, 3)."""
+        """Torque of gravity about each joint's origin, of all links it carries, N m, (n, k, 3).
+
+        As a vector in the robot base frame R.
+        """
         masses = self.chain.masses
         moments = masses[:, None] * apply(self.frames, self.chain.centers_of_mass)
         carried = np.cumsum(moments[:, ::-1], axis=1)[:, ::-1]
@@ -108,14 +111,14 @@ class Context:
 
     @cached_property
     def base_moment(self) -> FloatArray:
-        """Gravity's moment of the whole arm about the origin of R, N m, (n, 3)."""
+        """Torque of the whole arm's weight about the origin of the base frame R, N m, (n, 3)."""
         centers = apply(self.frames, self.chain.centers_of_mass)
         moment = np.sum(self.chain.masses[:, None] * centers, axis=1)
         return np.cross(moment, np.array(GRAVITY))
 
     @cached_property
     def has_gravity(self) -> bool:
-        """Whether the URDF has link masses."""
+        """Whether the URDF has link masses, so that gravity's torques are known."""
         return self.chain.has_inertials
 
     @cached_property
@@ -125,7 +128,10 @@ class Context:
 
     @cached_property
     def approach(self) -> FloatArray:
-        """Sign of each joint's last move that was a move at all, (n, k); 0 before the first."""
+        """Sign of each joint's last move, (n, k): +1 or -1; 0 before its first.
+
+        Moves of less than `STILL_RAD` do not count: the sign of the row before, in time, remains.
+        """
         still = STILL_RAD * self.chain.per_radian
         sign = np.where(np.abs(self.last_move) > still, np.sign(self.last_move), 0.0)
         order = np.argsort(self.measurements.stamp_s, kind='stable')
@@ -145,17 +151,17 @@ class Context:
 
     @property
     def has_motion(self) -> bool:
-        """Whether the arm moved during the measurements."""
+        """Whether the measurements have joint velocities: the arm was measured in motion."""
         return self.measurements.velocity is not None
 
     @cached_property
     def motion(self) -> MotionColumns:
-        """Functions of the rows' motion, of a session that `has_motion`."""
+        """Rates, friction, inertia and swing in each row; only for a session that `has_motion`."""
         return MotionColumns.of(self.chain, self.measurements, self.joint_offsets)
 
     @cached_property
     def marker_velocity(self) -> FloatArray:
-        """Velocity of the marker in R by the joints' velocities, m/s, (n, 3); 0 if unknown."""
+        """Velocity of each row's marker in the robot base frame R, m/s, (n, 3); 0 if unknown."""
         return np.einsum('nik,nk->ni', self.jacobian, self.motion.velocity)
 
     @cached_property
@@ -165,14 +171,17 @@ class Context:
 
     @cached_property
     def progress(self) -> FloatArray:
-        """Place of each row in the order of time, from 0 (the first) to 1 (the last), (n,)."""
+        """Rank of each row in time, scaled from 0 (the first) to 1 (the last), (n,).
+
+        Rows of equal time have equal values.
+        """
         _, rank = np.unique(self.elapsed_s, return_inverse=True)
         progress: FloatArray = rank / max(1, int(rank.max()))
         return progress
 
     @cached_property
     def has_time(self) -> bool:
-        """Whether the rows' times are known and lie apart."""
+        """Whether the rows' times are known and not all equal."""
         return self.timed and bool(np.ptp(self.elapsed_s) > 0.0)
 
     @cached_property
@@ -186,7 +195,10 @@ class Context:
         return np.where(known, given - first, 0.0)
 
     def lagging_warming(self, lag_s: float) -> FloatArray:
-        """Return `warming` through a first-order lag, from the first row on, K, (n,)."""
+        """Return `warming` delayed by a first-order lag, K, (n,); 0 at the first row.
+
+        ``lag_s``: time constant, s. Unknown temperatures are interpolated over time.
+        """
         if lag_s not in self._lagging:
             order = np.argsort(self.elapsed_s, kind='stable')
             known = order[np.isfinite(self.measurements.temperature_c[order])]
@@ -202,28 +214,35 @@ class Context:
 
     @cached_property
     def _lagging(self) -> dict[float, FloatArray]:
+        """Cache of `lagging_warming`: time constant, s -> values, K, (n,); {} at first."""
         return {}
 
     @cached_property
     def has_temperature(self) -> bool:
-        """Whether the temperature is known and varies."""
+        """Whether the temperature is known in at least `KNOWN_SHARE` of the rows, and varies.
+
+        It varies if its range is at least `LEAST_WARMING_K`.
+        """
         known = np.isfinite(self.measurements.temperature_c)
         return bool(np.mean(known) >= KNOWN_SHARE and np.ptp(self.warming) >= LEAST_WARMING_K)
 
     @cached_property
     def sensor_turn(self) -> FloatArray:
-        """Rotation of the row's sensor frame, R_R_N, (n, 3, 3)."""
+        """Rotation from the frame N of each row's sensor to the base frame R, R_R_N, (n, 3, 3)."""
         return self.T_R_N[self.sensor, :3, :3]
 
     @cached_property
     def in_sensor(self) -> FloatArray:
-        """Modelled markers in the frame N of the row's sensor, m, (n, 3)."""
+        """Position of each row's marker by the model, in its sensor's frame N, m, (n, 3)."""
         shift = self.points - self.T_R_N[self.sensor, :3, 3]
         return np.einsum('nji,nj->ni', self.sensor_turn, shift)
 
     @cached_property
     def centers(self) -> FloatArray:
-        """Mean of the modelled markers of each sensor's rows, in R, m, (sensors, 3)."""
+        """Mean modelled marker position of each sensor's rows, base frame R, m, (sensors, 3).
+
+        Zeros for a sensor without rows.
+        """
         points = self.chain.positions(
             self.measurements.q, self.markers[self.marker], self.joint_offsets
         )
@@ -233,14 +252,14 @@ class Context:
 
     @cached_property
     def range_m(self) -> FloatArray:
-        """Distance from the row's sensor, m, (n,)."""
+        """Distance of each row's marker by the model from its sensor, m, (n,)."""
         return np.linalg.norm(self.in_sensor, axis=1)
 
     def at(self, rows: IntArray) -> Context:
         """Return the context of some rows; ``rows``: their indices here, in the order wanted.
 
-        Every value is that which the row has here, also where it depends on other rows: time
-        since the first row, the move before, a sensor's centre.
+        Values that depend on other rows, too, such as the time since the first row, the
+        approach or a sensor's centre, are those that the row has here.
         """
         return PartOfContext(
             self.chain,
@@ -257,9 +276,10 @@ class Context:
         )
 
     def blocks(self, rows: int = BLOCK_ROWS) -> Iterator[tuple[slice, Context]]:
-        """Yield slices of at most `rows` rows with their contexts; all rows at once if few.
+        """Yield (slice of rows, its context) for blocks of at most `rows` rows, in order.
 
-        What a block computes goes with it, so memory does not grow with the rows.
+        If there are no more rows than that: one block, with this context itself. What a block
+        computes is stored in its context, so memory does not grow with the rows.
         """
         if len(self) <= rows:
             yield slice(0, len(self)), self
@@ -269,7 +289,7 @@ class Context:
             yield where, self.at(np.arange(where.start, where.stop))
 
     def sensors(self, *without: SensorKind) -> list[tuple[int, str]]:
-        """Return index and name of the sensors whose kind is none of these."""
+        """Return (index, name) of all sensors except those of the kinds in ``without``."""
         kinds = self.sensor_kinds or ('',) * len(self.sensor_names)
         return [
             (index, name)
@@ -278,26 +298,32 @@ class Context:
         ]
 
     def seen_by(self, sensor: int) -> BoolArray:
-        """Return whether a sensor measured each row, (n,)."""
+        """Mask of the rows that a sensor measured, (n,); ``sensor``: its index."""
         return self.sensor == sensor
 
     @cached_property
     def to_fit(self) -> BoolArray:
-        """Which rows are not held out, (n,)."""
+        """Mask of the rows that are not held out for validation, (n,)."""
         return ~self.measurements.is_validation
 
     def turns_over(self, joint: int) -> bool:
-        """Return whether a revolute joint (1-based) turns past a whole turn: errors recur."""
+        """Return whether a joint (1-based) turns, with limits more than a whole turn apart.
+
+        Its errors then recur after a turn.
+        """
         range_ = self.chain.upper[joint - 1] - self.chain.lower[joint - 1]
         return bool(range_ > MORE_THAN_A_TURN) and not self.slides(joint)
 
     def slides(self, joint: int) -> bool:
-        """Return whether a joint (1-based) slides."""
+        """Return whether a joint (1-based) is prismatic."""
         return bool(self.chain.slides[joint - 1])
 
     @cached_property
     def moving(self) -> tuple[int, ...]:
-        """Joints (1-based) that moved by more than `LEAST_TURN_RAD` in the rows to fit."""
+        """Joints (1-based) whose range in the rows to fit exceeds `LEAST_TURN_RAD`.
+
+        Of joints that slide the limit is `LEAST_TURN_RAD` times `SerialChain.per_radian`, m.
+        """
         span = np.ptp(self.measurements.q[self.to_fit], axis=0)
         least = LEAST_TURN_RAD * self.chain.per_radian
         return tuple(int(joint) + 1 for joint in np.flatnonzero(span > least))
@@ -308,24 +334,25 @@ class Context:
         return tuple(joint for joint in self.moving if not self.slides(joint))
 
     def links(self) -> Sequence[int]:
-        """Return the links, 1-based, whose geometry can matter: from joint j to joint j + 1.
+        """Return the numbers j = 1 to k - 1 of the links between joint j and joint j + 1.
 
-        What lies before joint 1 is part of the registration, behind the last joint of the marker.
+        Only their geometry matters: what is before joint 1 is part of the registration, what is
+        behind the last joint part of the marker.
         """
         return range(1, self.joints)
 
     def joint_origin(self, joint: int) -> FloatArray:
-        """Return the origin of a joint (1-based) in R, m, (n, 3)."""
+        """Return the origin of a joint's (1-based) frame in the robot base frame R, m, (n, 3)."""
         return self.frames[:, joint - 1, :3, 3]
 
     def link_rotation(self, joint: int) -> FloatArray:
-        """Return the rotation of the link moved by a joint (1-based) in R, (n, 3, 3)."""
+        """Return the rotation R_R_j of the link that joint j (1-based) moves, in R, (n, 3, 3)."""
         return self.frames[:, joint - 1, :3, :3]
 
 
 @dataclass(frozen=True, eq=False)
 class PartOfContext(Context):
-    """Some rows of a context; values that depend on several rows are those of all of it."""
+    """Some rows of a larger context; values that depend on other rows are taken from that."""
 
     # The context, and which of its rows these are, (n,)
     whole: Context
@@ -348,7 +375,7 @@ class PartOfContext(Context):
 
     @cached_property
     def elapsed_s(self) -> FloatArray:
-        """Time since the first row of the whole, s, (n,)."""
+        """Time since the first row of the whole context, s, (n,)."""
         return self.whole.elapsed_s[self.rows]
 
     @cached_property
@@ -363,7 +390,7 @@ class PartOfContext(Context):
 
     @cached_property
     def warming(self) -> FloatArray:
-        """Temperature above the first known one of the whole, K, (n,)."""
+        """`Context.warming` of the whole context in these rows, K, (n,)."""
         return self.whole.warming[self.rows]
 
     def lagging_warming(self, lag_s: float) -> FloatArray:
@@ -372,7 +399,7 @@ class PartOfContext(Context):
 
     @cached_property
     def has_temperature(self) -> bool:
-        """Whether the whole context has temperatures."""
+        """`Context.has_temperature` of the whole context."""
         return self.whole.has_temperature
 
     @cached_property

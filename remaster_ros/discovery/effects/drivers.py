@@ -24,7 +24,7 @@ _OF_SLIDES = {
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """Quantity on which an error may depend."""
+    """Quantity on which an error may depend, such as time or an angle: name, unit, values."""
 
     # As the candidates have them
     name: str
@@ -40,9 +40,10 @@ class Driver:
     def curve(
         self, context: Context, share: float, finest: float = 0.0, rows: BoolArray | None = None
     ) -> Curve:
-        """Return a free curve of the driver over the rows to fit, or those among them in ``rows``.
+        """Return a spline over the driver's values in the rows to fit, of zero mean over them.
 
-        ``share`` and ``finest`` are those of `Curve.of`.
+        ``share``, ``finest``: spacing of the knots, as in `Curve.of`; ``rows``: mask of rows,
+        (n,): only rows to fit among these count.
         """
         chosen = context.to_fit if rows is None else context.to_fit & rows
         turns_over = self.is_angle and context.turns_over(self.joint)
@@ -56,19 +57,25 @@ TEMPERATURE = Driver(
 
 
 def slow_drivers(context: Context) -> list[Driver]:
-    """Return the drivers that change over the session."""
+    """Return the drivers time and temperature, each if it is known and varies in the session."""
     found = [TIME] if context.has_time else []
     return found + ([TEMPERATURE] if context.has_temperature else [])
 
 
 def driver_at(context: Context, joint: int, name: str) -> str:
-    """Return the name of a driver of a joint (1-based), as ``angle`` or ``angle_of_joint_2``."""
+    """Return the name of a joint's (1-based) driver: ``name``, or another one if the joint slides.
+
+    Of a joint that slides 'angle_of_joint_2' becomes 'place_of_joint_2', for example.
+    """
     stem, of, number = name.partition('_of_joint_')
     return _OF_SLIDES.get(stem, stem) + of + number if context.slides(joint) else name
 
 
 def angle_of(context: Context, joint: int, name: str = 'own_angle') -> Driver:
-    """Return the angle of a joint (1-based), or the place of one that slides."""
+    """Return the driver that is a joint's measured angle, rad, or position, m, if it slides.
+
+    ``joint``: 1-based; ``name``: of the driver if the joint turns.
+    """
     slides = context.slides(joint)
     return Driver(
         driver_at(context, joint, name),
@@ -82,7 +89,10 @@ def angle_of(context: Context, joint: int, name: str = 'own_angle') -> Driver:
 
 
 def torque_of(context: Context, joint: int, name: str = 'gravity_torque') -> Driver:
-    """Return gravity's torque about a joint, or its force along one that slides."""
+    """Return the driver that is gravity's torque about a joint, N m, or its force on a slide, N.
+
+    ``joint``: 1-based; ``name``: of the driver if the joint turns.
+    """
     slides = context.slides(joint)
     return Driver(
         driver_at(context, joint, name),
@@ -95,7 +105,10 @@ def torque_of(context: Context, joint: int, name: str = 'gravity_torque') -> Dri
 
 
 def approach_of(context: Context, joint: int, name: str) -> Driver:
-    """Return the side that a joint came from."""
+    """Return the driver that is the sign of a joint's last move: 1, -1, or 0 before the first.
+
+    ``joint``: 1-based; ``name``: of the driver.
+    """
     return Driver(
         name,
         '1',
@@ -133,9 +146,10 @@ _OF_JOINTS: dict[str, Callable[[Context, int, str], Driver]] = {
 
 
 def driver_named(context: Context, name: str, joint: int) -> Driver | None:
-    """Return the driver of that name; None if the name is not that of a single quantity.
+    """Return the driver of a name, such as 'time', 'own_angle' or 'angle_of_joint_2'.
 
-    ``joint`` (1-based) is that of a name which has none.
+    ``joint`` (1-based): the driver's joint if the name has none. None if the name is not that of
+    a single quantity.
     """
     stem, _, given = name.partition('_of_joint_')
     if stem in _OF_JOINTS:

@@ -17,7 +17,10 @@ ORDERS = ((1,), (2,), (1, 2))
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Sine and cosine of the joint's own angle."""
+    """Yield candidates of waves of order 1, 2, and both together, for each joint that turned.
+
+    An order is a sine and a cosine of the measured angle, with a parameter each.
+    """
     for orders in ORDERS:
         yield from EFFECT.at_joints(
             context,
@@ -30,6 +33,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _waves(context: Context, joint: int, orders: tuple[int, ...]) -> list[FloatArray]:
+    """Return sin(h q) and cos(h q) of a joint's measured angle for each order h, (n,) each.
+
+    ``joint``: 1-based.
+    """
     angle = context.measurements.q[:, joint - 1]
     return [wave(order * angle) for order in orders for wave in (np.sin, np.cos)]
 

@@ -13,7 +13,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = s_j q_j."""
+    """Yield a candidate for each joint that moved: δq_j = s_j q_j, q_j as measured."""
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -24,7 +24,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _scaled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for how much more or less a joint moves than it reports, over its span."""
+    """Phrase for how much more or less a joint moves than it reports, and over the span measured.
+
+    ``draws``: of the scale error, (draws, 1).
+    """
     joint, scale = candidate.joints[0], draws[:, 0]
     more = 'more' if scale.mean() >= 0.0 else 'less'
     span = np.ptp(context.measurements.q[:, joint - 1])

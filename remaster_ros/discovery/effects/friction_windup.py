@@ -11,7 +11,11 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = w_j f_j, f_j with the sign of q̇_j, with memory."""
+    """Yield a candidate for each joint that turned: δq_j = w_j f_j + v_j (g_j - f_j).
+
+    f_j, g_j: shares of friction, -1 to 1, that take the sign of the joint's velocity within a
+    short and a long travel after a reversal (Dahl).
+    """
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -22,7 +26,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _wound(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the difference of a joint between its two directions of motion."""
+    """Phrase for how much a joint's angle differs between its two directions of motion.
+
+    Twice the first parameter; ``draws``: rad, (draws, 2).
+    """
     (joint,) = candidate.joints
     difference = of_joint(context, joint, 2.0 * draws[:, 0])
     return f'joint {joint} differs by {difference} between its two directions'

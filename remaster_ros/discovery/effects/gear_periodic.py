@@ -18,7 +18,11 @@ HIGHEST_ORDER = 400
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Sine and cosine at every whole order that the number of rows allows."""
+    """Yield candidates of a wave, sine and cosine, for each joint that turned and each order.
+
+    Orders are whole numbers of waves a turn, from `LOWEST_ORDER` to the lesser of `HIGHEST_ORDER`
+    and four times the number of rows.
+    """
     highest = int(min(HIGHEST_ORDER, 4 * len(context)))
     orders = range(LOWEST_ORDER, highest + 1)
     for order in orders:
@@ -33,6 +37,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _waves(context: Context, joint: int, order: int) -> list[FloatArray]:
+    """Return sine and cosine of `order` times a joint's (1-based) measured angle, (n,) each."""
     phase = order * context.measurements.q[:, joint - 1]
     return [np.sin(phase), np.cos(phase)]
 

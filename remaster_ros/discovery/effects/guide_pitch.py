@@ -19,7 +19,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each guide, about all three axes and about each of them."""
+    """Yield candidates for each slide that moved: turns about x, y, z, and about each alone."""
     for guide in Guide.each(context):
         for axes in ('xyz', *'xyz'):
             yield EFFECT.candidate(
@@ -32,6 +32,11 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _turned(context: Context, guide: Guide, axes: str) -> Design:
+    """Return columns of a carriage that turns along its way: a spline of the place for each axis.
+
+    ``axes``: letters of axes of the joint's frame, such as 'xyz'. Axes of a spline stand next to
+    each other; turns are about the joint's origin, rad per unit.
+    """
     features, frame = guide.features(context), context.link_rotation(guide.joint)
     turns = [
         features[:, [i]] * frame[:, :, 'xyz'.index(axis)]
@@ -42,7 +47,10 @@ def _turned(context: Context, guide: Guide, axes: str) -> Design:
 
 
 def _turns_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the largest turn of a carriage along its way."""
+    """Phrase for the largest angle by which a carriage turns along its way.
+
+    ``draws``: of the spline heights, rad, (draws, splines times axes).
+    """
     (joint,) = candidate.joints
     assert candidate.curve is not None
     features = candidate.curve.columns(context.measurements.q[:, joint - 1])

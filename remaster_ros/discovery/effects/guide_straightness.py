@@ -27,7 +27,7 @@ KNOTS = 10
 
 @dataclass(frozen=True, eq=False)
 class Guide:
-    """Guide of a joint (1-based) that slides, and the free curve of its place."""
+    """Guide of a prismatic joint (1-based): spline of the errors along its way."""
 
     joint: int
     curve: Curve
@@ -35,7 +35,7 @@ class Guide:
 
     @classmethod
     def each(cls, context: Context) -> Iterator[Guide]:
-        """Yield the guides on which the arm moved."""
+        """Yield the guide of each prismatic joint that moved in the rows to fit."""
         sliding = [joint for joint in context.moving if context.slides(joint)]
         for joint in sliding:
             driver = angle_of(context, joint)
@@ -44,11 +44,14 @@ class Guide:
             yield cls(joint, curve, {**fields, 'drawn_from': len(sliding)})
 
     def features(self, context: Context) -> FloatArray:
-        """Return the curve in each row by a unit of each free height, (n, m)."""
+        """Return the value of each free spline at the joint's place in each row, (n, m)."""
         return self.curve.columns(context.measurements.q[:, self.joint - 1])
 
     def parameters(self, *stems: str) -> list[str]:
-        """Return names of parameters: the stems of each free height next to each other."""
+        """Return names of parameters, one for each free spline and stem: 'guide_a_1_at_+200.0mm'.
+
+        The stems of a spline stand next to each other.
+        """
         return [
             f'{stem}_{self.joint}_at_{1e3 * place:+.1f}mm'
             for place in self.curve.places.tolist()
@@ -56,13 +59,16 @@ class Guide:
         ]
 
     def penalty(self, directions: int) -> FloatArray:
-        """Return the penalty on the heights of curves in some directions."""
+        """Return the roughness penalty of one curve for each of so many directions.
+
+        (m times directions) square; the directions of a spline stand next to each other.
+        """
         found: FloatArray = np.kron(self.curve.penalty, np.eye(directions)).astype(float)
         return found
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each guide, both directions across its way."""
+    """Yield a candidate for each slide that moved: shifts in both directions across its way."""
     for guide in Guide.each(context):
         yield EFFECT.candidate(
             partial(_shifted, guide=guide),
@@ -73,6 +79,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _shifted(context: Context, guide: Guide) -> Design:
+    """Return columns of a carriage that leaves its line: two shifts across it for each spline."""
     axis = context.chain.axes[guide.joint - 1]
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
@@ -85,7 +92,10 @@ def _shifted(context: Context, guide: Guide) -> Design:
 
 
 def _off_the_line(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the largest shift of a carriage across its way."""
+    """Phrase for the largest shift of a carriage across its way.
+
+    ``draws``: of the spline heights, m, (draws, 2 times splines).
+    """
     (joint,) = candidate.joints
     size = at_most(context, candidate, draws)
     return f'the carriage of joint {joint} is off its line by up to {size}'

@@ -11,7 +11,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = s_j τ_j."""
+    """Yield a candidate for each joint that turned: δq_j = s_j τ_j, τ_j: inertial torque, N m."""
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -22,7 +22,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _gave_way(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for a joint's deflection under its largest inertial torque."""
+    """Phrase for a joint's deflection under its largest inertial torque in the session.
+
+    ``draws``: of the compliance, rad/(N m), (draws, 1).
+    """
     joint = candidate.joints[0]
     torque = largest(context.motion.inertial_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)

@@ -18,7 +18,10 @@ RARITY = 3
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each joint after the first, about the axes of its frame that are not its own axis."""
+    """Yield tilts of each joint but the first, about axes of its frame that are not its own axis.
+
+    For each joint a candidate of all these axes together, and one of each axis alone.
+    """
     for joint in range(2, context.joints + 1):
         directions = tilt_directions(context, joint)
         # A tilt has any direction; on a whole arm some of them are other names for a link's.
@@ -36,7 +39,11 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _tilted(context: Context, joint: int, axes: list[FloatArray]) -> Design:
-    """Columns of tilts of a joint (from 1) about axes (3,) in its frame before its own move."""
+    """Return columns of tilts of a joint (1-based) about axes of its frame, rad per unit.
+
+    ``axes``: unit vectors, (3,), in the joint's frame as fixed to the link before, ahead of the
+    joint's own motion.
+    """
     # Where the joint is before its own move: one that slides carries its frame's origin along.
     before = context.frames[:, joint - 2] @ context.chain.T_fixed[joint - 1]
     turn = before[:, :3, :3]

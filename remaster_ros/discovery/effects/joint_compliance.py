@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = c_j τ_j."""
+    """Yield a candidate for each joint: δq_j = c_j τ_j, τ_j: gravity's torque (slide: force)."""
     return EFFECT.at_joints(
         context,
         range(1, context.joints + 1),
@@ -23,7 +23,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _turned(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for a joint's deflection under its largest gravity torque (force of a slide)."""
+    """Phrase for a joint's deflection under its largest gravity torque (force, if it slides).
+
+    ``draws``: of the compliance, rad/(N m) or m/N, (draws, 1).
+    """
     joint = candidate.joints[0]
     torque = largest(context.gravity_torque[:, joint - 1])
     moved = of_joint(context, joint, draws[:, 0] * torque)

@@ -18,7 +18,10 @@ LARGEST = 1e-2
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Joint j by every other joint l: linear, or sine and cosine of one that turns."""
+    """Yield errors of each joint that depend on the position of each other joint that moved.
+
+    For each pair one candidate in proportion, and one of sine and cosine if the other turns.
+    """
     units, counts = context.chain.units, context.chain.per_radian
     count = 2 * context.joints * max(1, len(context.moving) - 1)
     for joint in range(1, context.joints + 1):
@@ -47,13 +50,17 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _followed(context: Context, joint: int, other: int, form: str) -> Design:
-    """Columns of a joint's error by another joint's position: linear, or its sine and cosine."""
+    """Return columns of a joint's error as a function of another joint's measured position.
+
+    ``form``: 'linear' (1 column), else its sine and cosine (2 columns). Joints are 1-based.
+    """
     angle = context.measurements.q[:, other - 1]
     features = [angle] if form == 'linear' else [np.sin(angle), np.cos(angle)]
     return Design(joint - 1, np.stack(features, axis=-1))
 
 
 def _coupled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
+    """Phrase for the largest error: 'joint 3 turns with joint 2 by up to 1.1′ ± 0.3′'."""
     verb = 'slides' if context.slides(candidate.joints[0]) else 'turns'
     return up_to(f'joint {{joint}} {verb} with joint {{other}}')(context, candidate, draws)
 

@@ -27,7 +27,7 @@ ROWS_PER_KNOT = 6.0
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One curve per joint."""
+    """Yield a candidate for each joint that moved: a spline of its error over its own position."""
     configurations = len(np.unique(context.measurements.configuration[context.to_fit]))
     for joint in context.moving:
         driver, unit = angle_of(context, joint), context.chain.per_radian[joint - 1]
@@ -49,6 +49,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _splines(context: Context, joint: int, curve: Curve) -> Design:
+    """Return columns of a curve of a joint's error over its own position, one for each height.
+
+    Added joint position, rad or m per unit, (n, m); ``joint``: 1-based.
+    """
     return Design(joint - 1, curve.columns(context.measurements.q[:, joint - 1]))
 
 

@@ -11,7 +11,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint: δq_j = l_j q̇_j."""
+    """Yield a candidate for each joint that turned: δq_j = l_j q̇_j, l_j: delay of reports, s."""
     return EFFECT.at_joints(
         context,
         context.turning,
@@ -22,7 +22,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _late(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the delay of a joint's reports, ms."""
+    """Phrase for how late or early a joint's reports are, ms, by draws, s, (draws, 1)."""
     late = 1e3 * draws[:, 0]
     mean = float(late.mean())
     shown = number(abs(mean), float(late.std()), ' ms')

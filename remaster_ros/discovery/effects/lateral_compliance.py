@@ -16,9 +16,9 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """The bearing of each joint but the last, alike in both directions across its axis.
+    """Yield a candidate for the bearing of each joint but the first and the last.
 
-    That of joint 1 is a part of the base.
+    One compliance for both directions across the axis. The bearing of joint 1 counts as base.
     """
     links = context.links()[1:]
     for joint in links:
@@ -31,7 +31,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _moment(context: Context, joint: int) -> FloatArray:
-    """Return gravity's moment across the axis of a joint (1-based), in R, N m, (n, 3)."""
+    """Return gravity's torque across the axis of a joint (1-based), as a vector, N m, (n, 3).
+
+    In the robot base frame R; the component along the axis is taken out.
+    """
     moment = context.gravity_moment[:, joint - 1]
     axis = context.link_rotation(joint) @ context.chain.axes[joint - 1]
     across: FloatArray = moment - np.sum(moment * axis, axis=1)[:, None] * axis
@@ -39,11 +42,15 @@ def _moment(context: Context, joint: int) -> FloatArray:
 
 
 def _tipped(context: Context, joint: int) -> Design:
+    """Return columns of a joint (1-based) that tips across its axis under gravity's torque."""
     return turned(context, [_moment(context, joint)], context.joint_origin(joint))
 
 
 def _tips(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Text on the angle by which a joint tips under its largest lateral moment, by draws."""
+    """Phrase for the angle by which a joint tips under the largest torque across its axis.
+
+    ``draws``: of the compliance, rad/(N m), (draws, 1).
+    """
     (joint,) = candidate.joints
     moment = largest(np.linalg.norm(_moment(context, joint), axis=1))
     return f'joint {joint} tips by {angle(draws[:, 0] * moment)} under {moment:.0f} N m'

@@ -20,7 +20,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each link from joint j to joint j + 1, along its length and across it."""
+    """Yield a candidate for each link from joint j to j + 1 and each of its `link_directions`."""
     for link in context.links():
         directions = link_directions(context, link)
         for axis, direction in directions.items():
@@ -35,13 +35,17 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _shifted(context: Context, link: int, direction: FloatArray) -> Design:
+    """Return the column of a shift along a direction of the link's frame, m per m.
+
+    ``link``: 1-based, of the joint that moves it; ``direction``: unit vector, (3,).
+    """
     return displaced(context.link_rotation(link) @ direction)
 
 
 def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
-    """Return 'along' a link with the frame's axes (x, y, z) not parallel to it, as unit vectors.
+    """Return unit vectors of a link's frame by name: 'along' the link, and axes 'x', 'y', 'z'.
 
-    The axes alone for a link without length.
+    Axes parallel to the link are left out; 'along' is, if the link is shorter than 1 mm.
     """
     shift = context.chain.T_fixed[link][:3, 3]
     length = np.linalg.norm(shift)
@@ -57,7 +61,10 @@ def link_directions(context: Context, link: int) -> dict[str, FloatArray]:
 
 
 def _longer(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for a link that is longer than its model, or ends off it along an axis."""
+    """Phrase for how much longer or shorter a link is than modelled, or how far off it ends.
+
+    ``draws``: of the length or shift along an axis, m, (draws, 1).
+    """
     link, value, size = candidate.joints[0], draws[:, 0], length(along_mean(draws[:, :1]))
     if candidate.variant == 'along':
         longer = 'longer' if value.mean() >= 0.0 else 'shorter'

@@ -11,10 +11,10 @@ from remaster_ros.discovery.effects.sizes import up_to
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each marker, along the axes of the tool frame.
+    """Yield a candidate for each marker: a shift along each axis of the tool frame.
 
-    The offsets model fits the markers already: this one is judged by how far the fit moved them,
-    against their stated accuracy.
+    As the offsets model fits the markers already, it is judged by how far that fit moved a marker
+    against its stated accuracy.
     """
     for index, name in enumerate(context.marker_names):
         yield EFFECT.candidate(
@@ -26,6 +26,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _moved(context: Context, marker: int) -> Design:
+    """Return columns of a marker's shift along each tool axis; 0 in rows of other markers."""
     mine = (context.marker == marker)[:, None]
     return displaced(*(context.tool[:, :3, axis] * mine for axis in range(3)))
 

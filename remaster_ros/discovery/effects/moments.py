@@ -26,9 +26,10 @@ RARITY_OF_CHANGE = 3
 
 
 def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatArray:
-    """Return start and end of gaps between configurations, s since the first row, (m, 2).
+    """Return start and end of the gaps between successive configurations, s, (m, 2).
 
-    ``low, high``: of those that reach between two moments, s.
+    Since the first row. Gaps near the start and end of the session are left out (`LEAST_SHARE`).
+    ``low, high``: only gaps that overlap this interval, s.
     """
     _, row = np.unique(context.measurements.configuration, return_inverse=True)
     first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
@@ -44,7 +45,10 @@ def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatA
 
 
 def spread(found: FloatArray, count: int) -> FloatArray:
-    """Return at most `count` of some gaps, (m, 2), evenly spread over them."""
+    """Return at most `count` of some gaps, (m, 2), evenly spread over their order.
+
+    `found` itself if it is empty.
+    """
     if len(found) == 0:
         return found
     chosen = np.linspace(0, len(found) - 1, min(count, len(found)))
@@ -62,7 +66,11 @@ def after(context: Context, gap: FloatArray) -> FloatArray:
 
 
 def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
-    """Return the columns of a candidate from a moment in a gap on, or up to it; else 0."""
+    """Return the columns of a candidate, multiplied by the probability that it is present.
+
+    It is present from a moment in a gap on, or up to the moment if ``ends``. ``gap``: start and
+    end, s since the first row, between which the moment is uniform.
+    """
     design = candidate.columns(context)
     share = 1.0 - after(context, gap) if ends else after(context, gap)
     values = design.values * (share if design.values.ndim == 2 else share[:, None])
@@ -70,7 +78,10 @@ def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool
 
 
 def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Iterator[Candidate]:
-    """Yield the candidate changed in a gap, (2,): it begins or changes there, or it ends there."""
+    """Yield two candidates: one that begins or changes in a gap, and one that ends in it.
+
+    ``changes``: makes their columns; ``gap``: start and end, s since the first row.
+    """
     begins = replace(
         candidate,
         parameters=tuple(f'{name}_change' for name in candidate.parameters),
@@ -89,7 +100,11 @@ def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Itera
 def changed(
     context: Context, candidates: Iterable[tuple[Candidate, Changes | None]]
 ) -> Iterator[Candidate]:
-    """Yield candidates changed at moments spread over the session; none without times."""
+    """Yield candidates that begin, change or end at up to `MOMENTS_OF_CHANGE` moments.
+
+    ``candidates``: each with the function for the columns of its change; those with None, or
+    with a penalty, have no changes. Nothing is yielded if the session has no times.
+    """
     moments = spread(gaps(context), MOMENTS_OF_CHANGE) if context.has_time else np.zeros((0, 2))
     for candidate, changes in candidates:
         if changes is not None and candidate.penalty is None:

@@ -14,7 +14,10 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor's frame shifts steadily, or shifts and turns."""
+    """Yield two candidates for each sensor: a steady shift of its frame; a shift and a turn.
+
+    None for sensors of the kind 'controller'.
+    """
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index) & context.to_fit
         # The registration is that of the middle of the readings.
@@ -32,11 +35,16 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _crept(context: Context, sensor: int, middle: float, turning: bool) -> Design:
+    """Return columns of a sensor's steady shift (and turn, if `turning`), zero at `middle`, s."""
     return _columns(context, sensor, context.elapsed_s - middle, turning)
 
 
 def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool) -> Design:
-    """Columns of a sensor's shift (and turn, if `turning`) in proportion to the time passed, s."""
+    """Return columns of a sensor's shift in proportion to a time, and of its turn if `turning`.
+
+    ``passed_s``: the time in each row, s, (n,). Along and about the axes of the sensor's frame;
+    turns are about the centre of its points, rad/s. 0 in rows of other sensors.
+    """
     amount = (passed_s * context.seen_by(sensor))[:, None]
     axes = [context.sensor_turn[:, :, axis] for axis in range(3)]
     shifts = [amount * axis for axis in axes]
@@ -48,7 +56,10 @@ def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool)
 
 
 def _began(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
-    """Return a drift that begins, or becomes faster, at a moment, or ends then."""
+    """Return columns of a drift that begins, or becomes faster, or ends (``ends``) in a gap.
+
+    The moment is the middle of ``gap``, s since the first row, (2,).
+    """
     since_s = context.elapsed_s - gap.mean()
     since_s = np.minimum(since_s, 0.0) if ends else np.maximum(since_s, 0.0)
     sensor = context.sensor_names.index(candidate.subject)
@@ -56,7 +67,10 @@ def _began(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) 
 
 
 def _moved_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Text on a sensor's shift in the whole session, by draws of its speed, m/s, (draws, c)."""
+    """Phrase for how far a sensor moves in the whole session.
+
+    ``draws``: of its speeds, (draws, 3 or 6); the first three are m/s along its axes.
+    """
     hours = float(np.ptp(context.elapsed_s)) / 3600.0
     way = along_mean(draws[:, :3]) * hours * 3600.0
     return f'{candidate.subject} moves by {length(way)} in {hours:.1f} h'

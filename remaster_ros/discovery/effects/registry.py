@@ -50,18 +50,19 @@ OF_SLIDES = ('guide_straightness', 'guide_pitch')
 
 
 def _effect(module: str) -> Effect:
+    """Return the `EFFECT` of a module of this package, given by name."""
     effect: Effect = import_module(f'{__package__}.{module}').EFFECT
     return effect
 
 
 class _Effects(dict[str, Effect]):
-    """Effects of every session by name; those of some are found by name, and not listed."""
+    """Effects by name: those tried on every session; others are found by name, but not listed."""
 
     def __missing__(self, name: str) -> Effect:
         return MOTION[name] if name in MOTION else SLIDES[name]
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return an effect of any kind."""
+        """Return the effect of a name, also of those not listed; else ``default``."""
         return super().get(name, MOTION.get(name, SLIDES.get(name, default)))
 
 
@@ -71,6 +72,9 @@ EFFECTS = _Effects((effect.name, effect) for effect in map(_effect, MODULES))
 
 
 def effects_of(context: Context) -> dict[str, Effect]:
-    """Return the effects that are tried on a session: those of every one, and what it can have."""
+    """Return the effects that are tried on a session, by name.
+
+    Those of motion only if the arm was measured in motion, those of slides if a joint slides.
+    """
     found = {**EFFECTS, **(MOTION if context.has_motion else {})}
     return found | (SLIDES if context.chain.slides.any() else {})

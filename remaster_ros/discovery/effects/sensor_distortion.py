@@ -27,7 +27,10 @@ VARIANTS = (
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor that may have lenses: radial about its z axis, another one, or its origin."""
+    """Yield a candidate for each sensor that may have lenses, and each of `VARIANTS`.
+
+    That is every sensor but those of the kinds 'tracker' and 'controller'.
+    """
     for index, name in context.sensors('tracker', 'controller'):
         for variant, form, unit, axes in VARIANTS:
             kind = variant.replace(' ', '_')
@@ -44,7 +47,7 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _bent(context: Context, sensor: int, variant: str) -> Design:
-    """Columns of a sensor's distortion of the given variant, in the rows that it saw."""
+    """Return columns of a sensor's distortion of a variant of `VARIANTS`; 0 for other sensors."""
     mine = context.seen_by(sensor)[:, None]
     return displaced(
         *(
@@ -55,7 +58,11 @@ def _bent(context: Context, sensor: int, variant: str) -> Design:
 
 
 def distortions(p: FloatArray, variant: str) -> list[FloatArray]:
-    """Return the displacements in the sensor frame, m per unit, (n, 3) each, at p (n, 3)."""
+    """Return displacements by a distortion, one for each of its parameters, m per unit, (n, 3).
+
+    ``p``: points in the sensor's frame, m, (n, 3); ``variant``: a name of `VARIANTS`, all but
+    the first four taken for 'quadratic'.
+    """
     across = p * (1.0, 1.0, 0.0)
     square = np.sum(across**2, axis=1)[:, None]
     if variant == 'radial':

@@ -34,7 +34,11 @@ JITTER = 1e-6
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor, with a long and with a short length, and along the line of sight."""
+    """Yield three candidates for each sensor: a smooth field, a finer one, one of the distance.
+
+    Fields are sums of Gaussian kernels over the sensor's volume; the third is a spline of the
+    distance, along the line of sight. None for the kind 'controller' or with fewer than 6 poses.
+    """
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
         poses = len(np.unique(context.measurements.pose[mine]))
@@ -76,7 +80,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _centers(places: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return at most `count` cluster centres of places; fewer if readings were repeated."""
+    """Return at most `count` k-means centres of positions (n, 3), m, (c, 3).
+
+    Clusters without positions are left out, as if readings were repeated.
+    """
     with warnings.catch_warnings():
         # Two centers that begin at readings of one place: one of them remains without any.
         warnings.filterwarnings('ignore', 'One of the clusters is empty')
@@ -86,12 +93,16 @@ def _centers(places: FloatArray, count: int, rng: np.random.Generator) -> FloatA
 
 
 def _kernel(places: FloatArray, centers: FloatArray, length: float) -> FloatArray:
+    """Return the Gaussian kernel exp(-½ distance² / length²) of n places, c centres, (n, c)."""
     values: FloatArray = np.exp(-0.5 * cdist(places, centers, 'sqeuclidean') / length**2)
     return values
 
 
 def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
-    """Columns of an error along the line of sight: a spline of the range with these knots."""
+    """Return columns of an error along a sensor's line of sight: one for each spline of the range.
+
+    ``knots``: of the splines, m. 0 in rows of other sensors.
+    """
     sight = context.in_sensor / np.maximum(context.range_m, 1e-3)[:, None]
     along = np.einsum('nij,nj->ni', context.sensor_turn, sight)
     along = along * context.seen_by(sensor)[:, None]
@@ -99,7 +110,11 @@ def _along_sight(context: Context, sensor: int, knots: FloatArray) -> Design:
 
 
 def _field(context: Context, sensor: int, centers: FloatArray, length: float) -> Design:
-    """Columns of a sensor's field: kernels about centres (c, 3), m, along its axes; else 0."""
+    """Return columns of a sensor's field: a shift along its three axes for each kernel.
+
+    ``centers``: of the kernels, sensor frame, m, (c, 3); ``length``: of the kernel, m. 0 in rows
+    of other sensors.
+    """
     mine = context.seen_by(sensor)[:, None]
     features = _kernel(context.in_sensor, centers, length) * mine
     return displaced(*along_axes(features, context.sensor_turn))

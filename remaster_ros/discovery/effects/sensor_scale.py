@@ -15,7 +15,10 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor: one scale, one along its z axis (depth), or one per axis."""
+    """Yield candidates of a scale error for each sensor: in all directions, along z, or by axis.
+
+    Trackers have the first only; sensors of the kind 'controller' have none.
+    """
     x, y, z = np.eye(3)
     with_lens = context.sensors('tracker', 'controller')
     for index, name in context.sensors('controller'):
@@ -37,7 +40,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> Design:
-    """Columns of a sensor's scale along each of `directions`, in the rows that it saw."""
+    """Return columns of a sensor's scale error, m per unit, one for each of `directions`, (3,).
+
+    A direction has the factor for each axis of the sensor's frame. 0 in rows of other sensors.
+    """
     mine = context.seen_by(sensor)[:, None]
     return displaced(
         *(
@@ -48,7 +54,10 @@ def _stretched(context: Context, sensor: int, directions: list[FloatArray]) -> D
 
 
 def _long(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for a sensor's scale error, mm per metre, by axis."""
+    """Phrase for a sensor's scale error, mm per metre, for each axis if it has several.
+
+    ``draws``: m/m, (draws, 1 or 3).
+    """
     axes = [
         f' along {name.split("_")[1]}' if 'scale_' in name else '' for name in candidate.parameters
     ]

@@ -34,7 +34,11 @@ RARITY = 3
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Each sensor, with a long, a middling and a short memory."""
+    """Yield a slow, a middling and a fast random drift for each sensor with enough readings.
+
+    Correlation lengths are `LENGTHS`, shares of the session. None for sensors of the kind
+    'controller' or with fewer than `FEWEST_READINGS` readings.
+    """
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index)
         if np.sum(mine) < FEWEST_READINGS:
@@ -67,6 +71,11 @@ def _between(context: Context, knots: FloatArray) -> FloatArray:
 
 
 def _wandered(context: Context, sensor: int, knots: FloatArray, mean: FloatArray) -> Design:
+    """Return columns of a sensor's shift along its three axes by the value at each knot.
+
+    Linear between ``knots`` (shares of the session), less ``mean``, (knots,): mean of the weights
+    over the sensor's rows to fit. 0 in rows of other sensors.
+    """
     features = (_between(context, knots) - mean) * context.seen_by(sensor)[:, None]
     return displaced(*along_axes(features, context.sensor_turn))
 

@@ -12,7 +12,7 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """One candidate per joint that moved: δq_j = -s_j (q_j - from_q_j), 0 if unknown."""
+    """Yield a candidate for each joint that moved: δq_j = -s_j (q_j - from_q_j), 0 if unknown."""
     return EFFECT.at_joints(
         context,
         context.moving,
@@ -23,7 +23,10 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def _short(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for how far a joint stays short of its target after its largest move."""
+    """Phrase for how far a joint stays short of its target after its largest move.
+
+    ``draws``: of the missing share of a move, (draws, 1).
+    """
     joint = candidate.joints[0]
     move = largest(context.last_move[:, joint - 1])
     short = of_joint(context, joint, draws[:, 0] * move)

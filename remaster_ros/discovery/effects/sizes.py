@@ -21,15 +21,16 @@ MOST_DIGITS = 9
 
 
 def number(value: float, std: float, unit: str) -> str:
-    """Return '5.1′ ± 0.3′', with the digits that the uncertainty leaves."""
+    """Return value and standard deviation as text, rounded by the latter: '5.1′ ± 0.3′'."""
     text, std_text = rounded(value, std)
     return f'{text}{unit} ± {std_text}{unit}'
 
 
 def rounded(value: float, std: float, sign: str = '-') -> tuple[str, str]:
-    """Return value and standard deviation with the digits that the latter leaves.
+    """Return value and standard deviation as texts with as many decimals as the latter warrants.
 
-    With ``sign`` '+' the value has a sign in any case.
+    One significant digit of the standard deviation, two if it begins with 1; 3 decimals if it
+    is 0 or not finite. With ``sign`` '+' a positive value has a sign, too.
     """
     digits = 3
     if std > 0.0 and np.isfinite(std):
@@ -43,22 +44,25 @@ def rounded(value: float, std: float, sign: str = '-') -> tuple[str, str]:
 
 
 def angle(values: FloatArray) -> str:
-    """Return the mean and standard deviation of angles, rad, (draws,), in arc minutes."""
+    """Return mean ± standard deviation of angles, rad, (draws,), in arc minutes: '5.1′ ± 0.3′'."""
     return number(float(np.mean(values) / ARC_MINUTE), float(np.std(values) / ARC_MINUTE), '′')
 
 
 def length(values: FloatArray) -> str:
-    """Return the mean and standard deviation of lengths, m, (draws,), in millimetres."""
+    """Return mean ± standard deviation of lengths, m, (draws,), in mm: '1.2 mm ± 0.3 mm'."""
     return number(float(np.mean(values) / MM), float(np.std(values) / MM), ' mm')
 
 
 def of_joint(context: Context, joint: int, values: FloatArray) -> str:
-    """Return a joint's motion as text, angle or length; ``values``: draws, rad or m."""
+    """Return a joint's motion as text: as `angle`, or as `length` if the joint slides.
+
+    ``joint``: 1-based; ``values``: draws, rad or m, (draws,).
+    """
     return length(values) if context.slides(joint) else angle(values)
 
 
 def span_of(context: Context, joint: int, span: float) -> str:
-    """Return a joint's (1-based) span as text: '90°' or '600 mm'."""
+    """Return a joint's (1-based) span, rad or m, as text: '90°', or '600 mm' if it slides."""
     shown = context.chain.shown_scale[joint - 1] * span
     return f'{shown:.0f} mm' if context.slides(joint) else f'{shown:.0f}°'
 
@@ -75,14 +79,15 @@ def along_mean(draws: FloatArray) -> FloatArray:
 
 
 def largest(values: FloatArray) -> float:
-    """Return the largest absolute value; 0 of none."""
+    """Return the largest absolute value; 0 if there are no values."""
     return float(np.abs(values).max(initial=0.0))
 
 
 def at_most(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     """Return the largest error by a candidate as text: of a joint, less its mean, or of a marker.
 
-    In the row where the mean of the draws has it: the largest of each draw would be larger.
+    Taken in the row where it is largest by the mean of the draws: the mean over draws of each
+    one's largest would be larger. ``draws``: of its parameters, (draws, m).
     """
     columns = candidate.columns(context)
     if columns.at is not None:
@@ -94,9 +99,10 @@ def at_most(context: Context, candidate: Candidate, draws: FloatArray) -> str:
 
 
 def up_to(words: str) -> Callable[[Context, Candidate, FloatArray], str]:
-    """Return a size of the form 'joint 2 errs by up to 5.1′ ± 0.3′'.
+    """Return a function for the size of a candidate as text: 'joint 2 errs by up to 5.1′ ± 0.3′'.
 
-    ``{joint}``, ``{other}`` (the joint that drives) and ``{subject}`` of ``words`` are filled in.
+    ``words``: beginning of the text, in which ``{joint}``, ``{other}`` (the joint that drives)
+    and ``{subject}`` are filled in. The function takes context, candidate and draws.
     """
 
     def size(context: Context, candidate: Candidate, draws: FloatArray) -> str:

@@ -34,7 +34,10 @@ CLOSED_GAP = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Free curve of a driver (a spline) with zero mean over the values it was made for."""
+    """Cubic spline of a quantity (driver), bound to zero mean over the values it was made for.
+
+    Its free heights are those of all splines but one, which follows from the zero mean.
+    """
 
     knots: FloatArray  # Uniform, in the unit of the driver, (m + 4,), or (m + 7,) where closed
     # Where the turn begins that angles are brought to, rad; NaN where the driver is no angle of a
@@ -48,18 +51,19 @@ class Curve:
     def of(
         cls, values: FloatArray, share: float, finest: float = 0.0, turns_over: bool = False
     ) -> Curve:
-        """Return the curve of a driver's values in the rows to fit.
+        """Return the curve for a driver's values in the rows to fit.
 
         Parameters
         ----------
         values
-            (n,).
+            (n,), in the unit of the driver.
         share
             Distance of the knots as a share of the range of the values.
         finest
-            The least distance.
+            Least distance of the knots, in the unit of the driver.
         turns_over
-            Whether the driver is an angle, rad, that is the same after a turn.
+            Whether the driver is an angle, rad, of a joint that turns more than once: values are
+            brought into one turn, and the curve is closed if they fill it up to a small gap.
         """
         start = np.nan
         if turns_over:
@@ -77,20 +81,21 @@ class Curve:
         return cls(knots, start, closed, found.visited, weights)
 
     def among(self, values: FloatArray) -> Curve:
-        """Curve with these values of the driver as visited, (n,)."""
+        """Return a copy of the curve that counts these values, (n,), as the visited ones."""
         return replace(self, visited=np.unique(self.in_turn(values)))
 
     @property
     def step(self) -> float:
-        """Distance of the knots."""
+        """Distance of the knots, in the unit of the driver."""
         return float(self.knots[1] - self.knots[0])
 
     @cached_property
     def _pivot(self) -> int:
+        """Index of the spline with the largest mean, whose height follows from the zero mean."""
         return int(np.argmax(self.weights))
 
     def splines(self, values: FloatArray) -> FloatArray:
-        """Return the splines' values, (n, m), at values (n,)."""
+        """Return the values of all m splines at values (n,) of the driver, (n, m)."""
         found = basis(self.in_turn(values), self.knots)
         if not self.closed:
             return found
@@ -100,7 +105,10 @@ class Curve:
         return folded
 
     def columns(self, values: FloatArray) -> FloatArray:
-        """Return the curve at values (n,) by a unit of each free height, (n, m − 1)."""
+        """Return the curve's value by one unit of each free height, (n, m − 1).
+
+        ``values``: of the driver, (n,). m: number of splines.
+        """
         found = self.splines(values)
         ratio = self._others(self.weights) / self.weights[self._pivot]
         return self._others(found) - found[:, [self._pivot]] * ratio
@@ -113,29 +121,35 @@ class Curve:
 
     @property
     def heights(self) -> FloatArray:
-        """Heights of all splines by a unit of each free height, (m, m − 1)."""
+        """Matrix from the free heights to the heights of all m splines, (m, m − 1)."""
         heights: FloatArray = np.delete(np.eye(len(self.weights)), self._pivot, axis=1)
         heights[self._pivot] = -self._others(self.weights) / self.weights[self._pivot]
         return heights
 
     @property
     def penalty(self) -> FloatArray:
-        """Penalty on the free heights, (m − 1, m − 1)."""
+        """Roughness penalty on the free heights, (m − 1, m − 1)."""
         heights = self.heights
         found: FloatArray = heights.T @ roughness(len(heights), self.closed, CURVE_RIDGE) @ heights
         return found
 
     def grid(self, per_knot: int = 8) -> FloatArray:
-        """Return evenly spaced values of the driver over the whole curve, (g,)."""
+        """Return evenly spaced values of the driver from the first to the last knot, (g,).
+
+        ``per_knot``: number of steps between two knots.
+        """
         low, high = self.knots[DEGREE], self.knots[-DEGREE - 1]
         return np.linspace(low, high, 1 + round((high - low) / self.step) * per_knot)
 
     def in_turn(self, values: FloatArray) -> FloatArray:
-        """Return values (n,) brought to the turn of the curve."""
+        """Return values (n,) with whole turns added, so that they are in the turn of the curve.
+
+        Unchanged if the driver is no angle that turns over.
+        """
         return values if np.isnan(self.start) else in_turn(values, self.start)
 
     def seen(self, values: FloatArray, reach: float = 1.0) -> BoolArray:
-        """Return whether values, (n,), are within `reach` knot steps of a visited value, (n,)."""
+        """Mask of the values, (n,), within `reach` knot distances of a visited value, (n,)."""
         at, visited = self.in_turn(values), self.visited
         if not np.isnan(self.start):
             visited = np.concatenate((visited[-1:] - TURN, visited, visited[:1] + TURN))
@@ -146,13 +160,15 @@ class Curve:
         return found
 
     def _others(self, values: FloatArray) -> FloatArray:
+        """Return values, (…, m), without that of the pivot spline, (…, m − 1)."""
         return np.delete(values, self._pivot, axis=-1)
 
 
 def start_of_turn(values: FloatArray) -> float:
-    """Return the middle of the largest gap between angles, rad, less whole turns.
+    """Return the start of the turn into which angles are brought, rad.
 
-    So that most angles are in the turn from there.
+    It is the middle of the widest gap between them, less as many turns as leaves most angles
+    unchanged. ``values``: rad, (n,).
     """
     at = np.sort(np.mod(values, TURN))
     gaps = np.append(at[1:], at[0] + TURN) - at
@@ -163,7 +179,7 @@ def start_of_turn(values: FloatArray) -> float:
 
 
 def in_turn(values: FloatArray, start: float) -> FloatArray:
-    """Return angles (n,) brought to the turn that begins at ``start``, rad."""
+    """Return angles (n,), rad, with whole turns added: from ``start`` to a turn above it."""
     found: FloatArray = start + np.mod(values - start, TURN)
     return found
 
@@ -180,19 +196,26 @@ def knot_vector(low: float, high: float, spacing: float) -> FloatArray:
 
 
 def basis(values: FloatArray, knots: FloatArray) -> FloatArray:
-    """Return the splines at values (n,), (n, m); beyond the knots the values at the edge."""
+    """Return the values of all m cubic B-splines at values (n,), (n, m).
+
+    Beyond the first and last inner knot those at the nearest of these.
+    """
     low, high = knots[DEGREE], knots[-DEGREE - 1]
     inside = np.clip(values, low, high)
     return np.asarray(scipy.interpolate.BSpline.design_matrix(inside, knots, DEGREE).toarray())
 
 
 def centers(knots: FloatArray) -> FloatArray:
-    """Return the place of each spline's peak, (m,)."""
+    """Return the position of each cubic spline's peak, (m,): mean of its first and last knot."""
     return 0.5 * (knots[:-4] + knots[4:])
 
 
 def roughness(count: int, closed: bool = False, ridge: float = RIDGE) -> FloatArray:
-    """Return the penalty on m coefficients, (m, m): second differences and a small ridge."""
+    """Return the penalty matrix on `count` coefficients: second differences, and a ridge.
+
+    ``closed``: the last coefficient is a neighbour of the first; ``ridge``: added to the
+    diagonal. (count, count).
+    """
     if closed:
         unit = np.eye(count)
         differences = np.roll(unit, 1, axis=0) - 2.0 * unit + np.roll(unit, -1, axis=0)

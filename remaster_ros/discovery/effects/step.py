@@ -30,17 +30,27 @@ LARGEST_RAD = 2e-2
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Every place, at moments spread evenly over the configurations."""
+    """Yield steps at up to `MOMENTS` gaps between configurations, evenly spread over all gaps.
+
+    At each gap: of each joint's zero and each marker; of each sensor, and all sensors as the
+    base, a shift, and a shift with a turn.
+    """
     yield from _in(context, spread(gaps(context), MOMENTS))
 
 
 def between(context: Context, low: float, high: float) -> Iterator[Candidate]:
-    """Every place, in every gap that reaches between two moments."""
+    """Yield the steps of `candidates`, at every gap between configurations from `low` to `high`.
+
+    In s since the first row; gaps count that overlap this interval.
+    """
     yield from _in(context, gaps(context, low, high))
 
 
 def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
-    """Steps at the moments `chosen` of zero-offsets, markers, sensors, or all sensors together."""
+    """Yield steps in some gaps, (m, 2), s: of zero-offsets, markers, sensors, and all sensors.
+
+    All sensors together, as the base, only if there are several. None of the kind 'controller'.
+    """
     sensors: list[tuple[int, ...]] = [(index,) for index, _ in context.sensors('controller')]
     if len(sensors) > 1:
         sensors.append(tuple(index for (index,) in sensors))
@@ -85,10 +95,12 @@ def _in(context: Context, chosen: FloatArray) -> Iterator[Candidate]:
 
 
 def _slipped(context: Context, joint: int, gap: FloatArray) -> Design:
+    """Return the column of a joint (1-based) whose zero steps in a gap, (2,), s."""
     return Design(joint - 1, after(context, gap))
 
 
 def _marker_moved(context: Context, marker: int, gap: FloatArray) -> Design:
+    """Return columns of a marker that steps along the tool's axes in a gap, (2,), s."""
     mine = after(context, gap) * (context.marker == marker)[:, None]
     return displaced(*along_axes(mine, context.tool[:, :3, :3]))
 
@@ -96,7 +108,11 @@ def _marker_moved(context: Context, marker: int, gap: FloatArray) -> Design:
 def _sensor_moved(
     context: Context, sensors: tuple[int, ...], gap: FloatArray, turning: bool
 ) -> Design:
-    """Columns of sensors shifted (and turned, if `turning`) together at a moment in a gap, s."""
+    """Return columns of sensors that shift (and turn, if `turning`) together in a gap, (2,), s.
+
+    ``sensors``: their indices. Along the axes of the sensor, or of the base frame if there are
+    several; turns are about the centre of their points.
+    """
     mine = after(context, gap) * np.isin(context.sensor, sensors)[:, None]
     # Along the axes of the sensor, or of the base where all of them are concerned.
     turn = context.sensor_turn if len(sensors) == 1 else np.eye(3)[None]
@@ -109,7 +125,10 @@ def _sensor_moved(
 
 
 def _jump(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the size and direction of a step of a joint, sensor or marker."""
+    """Phrase for the size of a step of a joint, sensor, marker or the base, with its direction.
+
+    ``draws``: rad or m of a joint, (draws, 1); else shifts, m, and turns, rad, (draws, 3 or 6).
+    """
     if candidate.place == 'joint_angle':
         return (
             f'joint {candidate.joints[0]} by {of_joint(context, candidate.joints[0], draws[:, 0])}'

@@ -24,7 +24,11 @@ LAGS_S = (600.0, 1800.0, 5400.0)
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """The whole arm, and each link, in proportion to warming and to time."""
+    """Yield growth of the whole arm, and of each link, in proportion to temperature and to time.
+
+    Each driver only if it varies. With temperature and times also growth of the whole arm by a
+    temperature that lags, one for each of `LAGS_S`.
+    """
     arm: tuple[int, ...] = ()
     parts = [arm, *((link,) for link in context.links() if _has_length(context, link))]
     for driver in slow_drivers(context):
@@ -58,11 +62,15 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 
 def lagging(lag_s: float) -> Driver:
-    """Return the driver of a temperature that lags the thermometer by a time constant, s."""
+    """Return a temperature driver that follows the thermometer with a time constant, s."""
     return replace(TEMPERATURE, value=lambda context: context.lagging_warming(lag_s))
 
 
 def _grown(context: Context, driver: Driver, joints: tuple[int, ...]) -> Design:
+    """Return the column of links that grow in proportion to a driver.
+
+    ``joints``: numbers of the links; () for all, with the base.
+    """
     links = joints or range(context.joints + 1)
     return displaced(driver.value(context)[:, None] * sum(link_vector(context, j) for j in links))
 
@@ -81,14 +89,17 @@ def _has_length(context: Context, link: int) -> bool:
 
 
 def needs_warming(context: Context) -> str:
-    """Return why growth cannot be tested; '' if it can."""
+    """Return the reason why growth cannot be tested; '' if temperature or time varies."""
     if context.has_temperature or context.has_time:
         return ''
     return 'neither temperature nor time varies' if context.timed else NO_TIMES
 
 
 def _grown_by(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the growth of 1 m of a link (or the arm) over the span of the driver."""
+    """Phrase for the growth of 1 m of a link (or the arm) over the range of the driver.
+
+    ``draws``: relative growth per unit of the driver, (draws, 1).
+    """
     part = f'of link {candidate.joints[0]}' if candidate.joints else 'of the arm'
     driver = driver_named(context, candidate.driver, 0)
     assert driver is not None

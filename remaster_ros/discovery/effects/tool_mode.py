@@ -14,18 +14,26 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """The tool as a whole: δp = -R diag(m) R' a, one m for each axis of the tool."""
+    """Yield one candidate: δp = -R diag(m) R' a - R diag(n) R' b, 3 parameters m and 3 n, s².
+
+    m = 1/(2πf)² of the tool's first mode f along each axis of the tool. a: acceleration of the
+    tool frame; b: of the middle of the markers, less a.
+    """
     yield EFFECT.candidate(_swung, MODES)
 
 
 def _swung(context: Context) -> Design:
-    """Columns of the marker displaced by the tool's swing."""
+    """Return columns of the marker displaced by the tool's swing, m per s², one for each of 6."""
     swing = context.motion.swing(context.markers.mean(axis=0))
     return displaced(*(swing[:, :, column] for column in range(len(MODES))))
 
 
 def _frequency(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the frequency, Hz, of the tool's softest axis."""
+    """Phrase for the frequency, Hz, at which the tool swings along its softest axis.
+
+    ``draws``: of the parameters of `candidates`, s², (draws, 6); the softest has the largest
+    mean of the first three.
+    """
     axis = int(np.argmax(draws[:, :3].mean(axis=0)))
     softest = np.maximum(draws[:, axis], 1e-7)
     hertz = 1.0 / (2.0 * np.pi * np.sqrt(softest))

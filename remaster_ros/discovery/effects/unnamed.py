@@ -44,7 +44,11 @@ Feature = Callable[[Context], FloatArray]
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """All candidates that no named effect has."""
+    """Yield all candidates without a name: errors of joints, links, base, markers and sensors.
+
+    As functions of the quantities that they may depend on, without those that a named effect
+    has.
+    """
     found = [*_joint_angles(context), *_links(context), *_frames(context)]
     for candidate in found:
         yield replace(candidate, drawn_from=RARITY * len(found))
@@ -52,7 +56,11 @@ def candidates(context: Context) -> Iterator[Candidate]:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """Function of a driver: its m features, (n, m), with suffixes and unit of the parameters."""
+    """Function by which an error depends on a driver, such as 'linear' or 'free', as features.
+
+    ``features``: of a context, (n, m); ``suffixes``: of the m parameters' names; ``unit``: of
+    the driver's part, to follow the error's unit.
+    """
 
     driver: str
     name: str
@@ -67,7 +75,12 @@ class _Form:
 def _forms(
     context: Context, driver: Driver, *names: str, rows: BoolArray | None = None
 ) -> Iterator[_Form]:
-    """Yield forms of a driver over all rows to fit or some; none if the driver hardly varies."""
+    """Yield forms of a driver: 'linear', 'quadratic', 'sin/cos' or 'free' (a spline).
+
+    ``names``: which of them; ``rows``: mask of rows, (n,), over which the spline is made; only
+    rows to fit among these (all, if None). Nothing if the driver varies by less than 1e-9
+    there.
+    """
     values = driver.value(context)[context.to_fit if rows is None else context.to_fit & rows]
     if not len(values):
         return
@@ -90,14 +103,26 @@ def _forms(
 
 
 def _power(context: Context, value: Feature, power: int) -> FloatArray:
+    """Return a driver's values to a power, unscaled, as one feature, (n, 1).
+
+    ``value``: function from a context to the driver's values, (n,).
+    """
     return value(context)[:, None] ** power
 
 
 def _sine_cosine(context: Context, value: Feature) -> FloatArray:
+    """Return sine and cosine of a driver's values as two features, (n, 2).
+
+    ``value``: function from a context to the driver's values, rad, (n,).
+    """
     return np.stack((np.sin(value(context)), np.cos(value(context))), axis=-1)
 
 
 def _spline(context: Context, value: Feature, curve: Curve) -> FloatArray:
+    """Return the free splines of a curve at a driver's values as features, (n, m).
+
+    ``value``: function from a context to the driver's values, (n,).
+    """
     return curve.columns(value(context))
 
 
@@ -111,7 +136,11 @@ def _candidate(
     subject: str = '',
     **more: Any,
 ) -> Candidate:
-    """Candidate of a form at a place; stems and the form's suffixes name its parameters."""
+    """Return the unnamed candidate of a form at a place.
+
+    Its parameters are named by ``stems``, each with each of the form's suffixes; ``unit``: of
+    the error, before that of the form; ``more``: further arguments of `Candidate`.
+    """
     return EFFECT.candidate(
         columns,
         [f'{stem}{suffix}' for suffix in form.suffixes for stem in stems],
@@ -129,7 +158,13 @@ def _candidate(
 
 
 def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...], _Form]]:
-    """Yield forms of the drivers of a joint's angle, with the joints concerned."""
+    """Yield forms by which an unnamed error of a joint's position may depend on a driver.
+
+    Linear, quadratic or free functions of its own angle, approach, last move and gravity
+    torque, of those of other joints, of time or of temperature; each with its joints
+    (1-based): this one, then the driver's if that is another. None of a driver that hardly
+    varies.
+    """
 
     def by(driver: Driver, *names: str) -> Iterator[tuple[tuple[int, ...], _Form]]:
         joints = (joint,) if driver.joint in (0, joint) else (joint, driver.joint)
@@ -165,7 +200,7 @@ def _joint_forms(context: Context, joint: int) -> Iterator[tuple[tuple[int, ...]
 
 
 def _joint_angles(context: Context) -> Iterator[Candidate]:
-    """Angles: by own angle squared, by other joints, by torques, over time and temperature."""
+    """Yield the candidates of each joint's position, one for each of its `_joint_forms`."""
     for joint in range(1, context.joints + 1):
         for joints, form in _joint_forms(context, joint):
             stem = f'joint_{joint}_by_{form.driver}'
@@ -189,21 +224,29 @@ def _rms(values: FloatArray) -> float:
 
 
 def _at(context: Context, joint: int, form: _Form) -> Design:
+    """Return columns that add a form's features to a joint's (1-based) position."""
     return Design(joint - 1, form.features(context))
 
 
 def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
-    """Columns of a shift along each axis of a rotation (n, 3, 3), for each feature of a form."""
+    """Return columns of a shift that follows a form: 3 for each of its m features.
+
+    Along each axis of the frames ``turn``, rotation matrices of a context, (n, 3, 3).
+    """
     return displaced(*along_axes(form.features(context), turn(context)))
 
 
 def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> Design:
-    """Turn about the axes of a rotation (n, 3, 3) through points (n, 3), for each feature."""
+    """Return columns of a rotation that follows a form: 3 for each of its m features.
+
+    About each axis of the frames ``turn``, (n, 3, 3), through the points ``about``, m, (n, 3):
+    functions of a context. Displacements of the marker, m per rad.
+    """
     return turned(context, along_axes(form.features(context), turn(context)), about(context))
 
 
 def _links(context: Context) -> Iterator[Candidate]:
-    """Links that shift or turn over time or by temperature."""
+    """Yield candidates of each link that shifts or turns in proportion to time or temperature."""
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     for link in context.links():
         turn = partial(Context.link_rotation, joint=link)
@@ -217,32 +260,39 @@ def _links(context: Context) -> Iterator[Candidate]:
 
 
 def _base_turn(context: Context) -> FloatArray:
+    """Return the rotation of the base frame R in itself, the identity, (n, 3, 3)."""
     return np.broadcast_to(np.eye(3), (len(context), 3, 3))
 
 
 def _base_origin(context: Context) -> FloatArray:
+    """Return the origin of the base frame R, zeros, m, (n, 3)."""
     return np.zeros((len(context), 3))
 
 
 def _tool_turn(context: Context, marker: int) -> FloatArray:
+    """Return the rotation of the tool frame in R, (n, 3, 3); 0 in rows of other markers."""
     return context.tool[:, :3, :3] * (context.marker == marker)[:, None, None]
 
 
 def _sensor_turn(context: Context, sensor: int) -> FloatArray:
+    """Return the rotation of a sensor's frame in R, (n, 3, 3); 0 in rows of other sensors."""
     return context.sensor_turn * context.seen_by(sensor)[:, None, None]
 
 
 def _sagging(context: Context, marker: int) -> Design:
-    """Columns of a marker's stem that bends under its weight, across the tool's z axis."""
+    """Return the column of a marker whose stem, along the tool's z axis, bends under gravity.
+
+    Component of gravity's direction across that axis, m per m; 0 in rows of other markers.
+    """
     axis = context.tool[:, :3, 2]
     across = np.array((0.0, 0.0, -1.0)) + axis * axis[:, 2:]
     return displaced((context.marker == marker)[:, None] * across)
 
 
 def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
-    """Columns of a shift along a sensor's lines of sight, by a power of the distance, m.
+    """Return the column of a shift along a sensor's lines of sight, by a power of the distance, m.
 
-    Rows of other sensors are 0.
+    ``power``: 0 is a constant shift. Rows of other sensors are 0.
     """
     distance = np.maximum(context.range_m, 1e-3)
     along = np.einsum('nij,nj->ni', context.sensor_turn, context.in_sensor)
@@ -250,7 +300,11 @@ def _line_of_sight(context: Context, sensor: int, power: int) -> Design:
 
 
 def _frames(context: Context) -> Iterator[Candidate]:
-    """Base, markers and sensors: over time, by temperature, gravity, joint 1, range."""
+    """Yield candidates of errors of the base, the markers and the sensors.
+
+    The base turns with time, temperature or joint 1; markers shift with time, temperature or
+    gravity; sensors shift with temperature, or along the line of sight with the distance.
+    """
     slow = [form for driver in slow_drivers(context) for form in _forms(context, driver, 'linear')]
     first = angle_of(context, 1, 'angle_of_joint_1')
     # What twists and bends a rail has a name (`guide_pitch`).
@@ -295,7 +349,10 @@ def _frames(context: Context) -> Iterator[Candidate]:
 
 
 def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
-    """Yield forms of the drivers of a sensor's shift, without time, which has named causes."""
+    """Yield forms by which a sensor's shift may depend on temperature: linear, and free.
+
+    ``sensor``: its index, over whose rows the free form is made. Time has named causes.
+    """
     for driver in slow_drivers(context):
         if driver == TIME:
             continue
@@ -309,7 +366,10 @@ def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
 
 
 def _size(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the largest error of a free form, of a joint or the marker."""
+    """Phrase for the largest error by an unnamed candidate, of a joint or of the marker.
+
+    ``draws``: of its parameters, (draws, m).
+    """
     what = (
         f'joint {candidate.joints[0]} errs'
         if candidate.place == 'joint_angle'

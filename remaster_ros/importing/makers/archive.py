@@ -31,9 +31,9 @@ _DAMAGED = (
 
 @contextmanager
 def damage_as_input_error() -> Iterator[None]:
-    """Raise InputError in place of the exceptions for a damaged or locked archive.
+    """Context that replaces the exceptions for a damaged or locked zip archive by InputError.
 
-    Context manager. An InputError passes as it is.
+    An InputError passes as it is.
     """
     try:
         yield

@@ -21,8 +21,8 @@ _LONGEST = 200
 def read(text: str) -> NamedColumns | None:
     """Points of a report with one number a line; None for other text.
 
-    Columns X, Y and Z, and ``name`` if the points have several. Raises InputError, with the line,
-    if axes do not follow each other as X, Y and Z of one point.
+    Columns X, Y and Z, and before them ``name`` if the points have different names. Raises
+    InputError, with the line, if the axes of a point are not X, Y and Z in this order.
     """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [match['axis'] for _, line in lines[:_SEEN] if (match := _match(line))]
@@ -64,5 +64,8 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _match(line: str) -> re.Match[str] | None:
-    """Match of a line with name, axis and value; None for others, and over 200 letters."""
+    """Match of a line with an axis, its value and perhaps a name; None for other lines.
+
+    None also for lines of over 200 letters.
+    """
     return _LINE.fullmatch(line) if len(line) <= _LONGEST else None

@@ -19,10 +19,10 @@ _EXPECTED = 'posj(…) with an angle in degrees for each joint, once a line,'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a program in DRL, degrees; None for other text.
+    """Joint positions, posj(…), of a Doosan program (DRL), degrees; None for other text.
 
-    Cartesian positions are left out, with a note. Raises InputError, with the line, for relative
-    moves, text that cannot be read, or if there are no joint positions.
+    Cartesian positions are left out, with a note. Raises InputError, with the line, for
+    relative moves, text that cannot be read, or if there are no joint positions.
     """
     if not _CALL.search(text):
         return None

@@ -32,9 +32,10 @@ _OF_GROUP = re.compile(r'\s*(?:Group\s*:\s*(\d+))?\s*(?:Config\s*:\s*([^:=]*))?\
 def read(text: str) -> NamedColumns | None:
     """Joint positions of a FANUC program or of position registers; None for other text.
 
-    In degrees, J3 coupled to J2. Cartesian and untaught positions and other motion groups are left
-    out, with notes. Raises InputError, with the line, for text that cannot be read, increments, or
-    if there are no joint positions.
+    Degrees as the controller counts them, with the coupling of J3 to J2 noted in the result.
+    Cartesian and untaught positions and other motion groups are left out, with notes. Raises
+    InputError, with the line, for text that cannot be read, increments, or if there are no
+    joint positions.
     """
     if re.search(r'\$POSREG\b.*\bARRAY\b', text):
         return _registers(text)
@@ -156,10 +157,11 @@ def _positions(
     untaught: int,
     has_other_groups: bool,
 ) -> NamedColumns:
-    """Columns of joint positions, with notes on what was left out.
+    """Columns of the joint positions, with notes on what was left out.
 
-    `places`, `untaught`: numbers of Cartesian and untaught positions; `has_other_groups`: whether
-    there were other motion groups.
+    `kind`: of the file, in words; `found`: line, name and axes of each position; `places`,
+    `untaught`: numbers of Cartesian and untaught positions; `has_other_groups`: whether there
+    were other motion groups.
     """
     notes = (f'{places} Cartesian positions were left out',) * bool(places)
     notes += (f'{untaught} positions that were never taught were left out',) * bool(untaught)

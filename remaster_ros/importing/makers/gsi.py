@@ -20,10 +20,10 @@ _DIGITS = {'0': 0, '6': 1, '8': 2}
 
 
 def read(text: str) -> NamedColumns | None:
-    """Points of a file in GSI, mm, with their names; None for other text.
+    """Points of a file in Leica's GSI, mm, with their names; None for other text.
 
-    Lines without coordinates are left out, with a note. Raises InputError, with the line, for a
-    line that is no GSI, coordinates that are not metric, or if there are none.
+    Lines without a name or coordinates are left out, with a note. Raises InputError, with the
+    line, for a line that is no GSI, coordinates that are not metric, or if there are none.
     """
     lines = [(i, line.strip()) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     if not lines or not _LINE.fullmatch(lines[0][1]):

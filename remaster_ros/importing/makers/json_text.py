@@ -19,10 +19,11 @@ _START = re.compile(r'\s*(?:\{\s*"|\[\s*[\[{])')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Records of JSON or of JSON lines; None for other text.
+    """Records of JSON or of JSON lines as named columns; None for other text.
 
-    Raises InputError, with the line, for damaged JSON, a key that is there twice, or JSON without
-    records of equal keys.
+    None also for a list in each line, or a matrix as programs print it. Raises InputError,
+    with the line, for damaged JSON, a key that is there twice, or JSON without records of
+    equal keys.
     """
     if not _START.match(text):
         return None
@@ -53,11 +54,11 @@ class _Decoder(json.JSONDecoder):
         self.scan_once = json.scanner.py_make_scanner(self)  # type: ignore[attr-defined]
 
     def whole(self) -> Any:
-        """The value of the text, or a list of several values if the first is an object.
+        """Decoded value of the text; of several values, the first an object, a list of all.
 
-        None for several others (a list in each line), or if a first value that begins with [[ is
-        not JSON (a printed matrix). Raises InputError, with the line, for other text that is not
-        JSON.
+        None if there are several values and the first is no object (a list in each line), or
+        if text that begins with [[ is not JSON (a printed matrix). Raises InputError, with the
+        line, for other text that is not JSON.
         """
         values = records.Items()
         at = 0
@@ -79,13 +80,13 @@ class _Decoder(json.JSONDecoder):
         return values[0] if len(values) == 1 else values
 
     def _line(self, at: int) -> int:
-        """Line, from 1, of a place in the text."""
+        """Line number, from 1, of an index into the text."""
         return bisect_left(self._ends, at) + 1
 
     def _array(self, at: tuple[str, int], scan_once: Any, **options: Any) -> Any:
-        """Decode an array, with the line of its begin; return it and the index behind it.
+        """Decode an array as `Items`, which has its line; return it and the index behind it.
 
-        `at`: text and index behind the bracket.
+        `at`: text, and index behind the opening bracket. The others are as json passes them.
         """
         values, end = json.decoder.JSONArray(at, scan_once, **options)  # type: ignore[attr-defined]
         found = records.Items(values)
@@ -93,8 +94,9 @@ class _Decoder(json.JSONDecoder):
         return found, end
 
     def _object(self, at: tuple[str, int], *args: Any, **options: Any) -> Any:
-        """Decode an object, with the line of its begin; return it and the index behind it.
+        """Decode an object as `Mapping`, which has its line; return it and the index behind it.
 
+        `at`: text, and index behind the opening brace. The others are as json passes them.
         Raises InputError if a key is there twice.
         """
         strict, scan_once, memo = args[0], args[1], args[4] if len(args) > 4 else None

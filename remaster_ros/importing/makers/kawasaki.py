@@ -18,10 +18,10 @@ _EXPECTED = '#name and an angle for each joint'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint displacements of a text in AS, degrees; None for other text.
+    """Joint displacements in a Kawasaki file or program (AS), degrees; None for other text.
 
-    Transformations are left out, with a note. Raises InputError, with the line, for text that
-    cannot be read, or if there are no joint displacements.
+    Transformations (Cartesian) are left out, with a note. Raises InputError, with the line,
+    for text that cannot be read, or if there are no joint displacements.
     """
     if not (
         re.search(r'^[ \t]*\.JOINTS', text, re.MULTILINE | re.IGNORECASE) or _CALL.search(text)

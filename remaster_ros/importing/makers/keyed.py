@@ -20,11 +20,11 @@ _DELIMITERS = ' \t:;,=<("'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Numbers by their names; None for other text.
+    """Columns of a log in which a name precedes each number; None for other text.
 
     Of the first 50 lines with three numbers, over half must have three named ones. Lines with
-    fewer numbers are left out, with a note. Raises InputError, with the line, if names differ
-    between lines.
+    up to two numbers are left out, with a note. Raises InputError, with the line, if names
+    differ between lines.
     """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [line for _, line in lines[:_SEEN] if len(_NUMBERS.findall(line)) >= _FEWEST]

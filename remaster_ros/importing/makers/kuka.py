@@ -27,7 +27,7 @@ _EXPECTED = '{E6AXIS: A1 …, A2 …} with a number for each axis'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Axis positions in a text of KUKA's, degrees; None for other text.
+    """Axis positions in a program, data file or log of KUKA, degrees; None for other text.
 
     Cartesian points are left out, with a note. Raises InputError, with the line, for relative
     moves, text that cannot be read, or if there are no axis positions.
@@ -72,24 +72,26 @@ def read(text: str) -> NamedColumns | None:
 def moves(text: str) -> tuple[str, ...]:
     """Names of the points to which the moves of a program go, in order, with repetitions.
 
-    Moves are PTP, LIN, SPTP and SLIN at the begin of a line; () if there are none.
+    Moves are PTP, LIN, SPTP and SLIN at the begin of a line; XP1 is named P1. () if there are
+    none.
     """
     codes = (line.partition(';')[0] for line in text.splitlines())
     return tuple(_point(found[1]) for found in map(_MOVE.match, codes) if found)
 
 
 def _point(name: str) -> str:
-    """Name of a point from the name of its data: P1 for XP1; other names stay."""
+    """Name of a point by the name of its data: P1 for XP1; names without X in front stay."""
     return name[1:] if name.upper().startswith('X') and len(name) > 1 else name
 
 
 def _position(
     number: int, line: str, before: str, aggregate: re.Match[str]
 ) -> tuple[str, dict[str, str]]:
-    """Name of a position ('' if it has none) and its axes.
+    """Name of a position ('' if it has none), and its axes: name -> value as text.
 
-    ``before``: text between the previous position and this one. Raises InputError for text that is
-    no axis position.
+    ``aggregate``: match of its braces; ``before``: text between the previous position and this
+    one; ``number``, ``line``: for the message. Raises InputError for text that is no axis
+    position.
     """
     values: dict[str, str] = {}
     for part in aggregate[1].split(','):

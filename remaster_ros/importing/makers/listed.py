@@ -30,11 +30,11 @@ _FEWEST, _MOST = 2, 12
 
 
 def read(text: str) -> NamedColumns | None:
-    """Lists of a log, with their names or times; None for other text.
+    """Lists in brackets, one in each line of a log, with names or times; None for other text.
 
     Lists of three numbers are points, of 4 to 12 joints. Lines with up to two numbers are left
-    out, with a note. Raises InputError, with the line, for other lines, lists of other lengths,
-    Cartesian poses, or external axes in use.
+    out, with a note. Raises InputError, with the line, for other lines, lists of other lengths
+    than the first, Cartesian poses, or external axes in use.
     """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     # Titles and keys have no numbers.
@@ -99,7 +99,10 @@ def _label_and_list(line: re.Match[str]) -> tuple[str, str]:
 
 
 def _has_no_external_axes(line: re.Match[str] | None) -> bool:
-    """Whether the external axes of a line are absent, unused (from 9e9 on) or at 0."""
+    """Whether the external axes of a line are absent, unused (from 9e9 on) or at 0.
+
+    `line`: match of `_LINE`; None counts as absent.
+    """
     external = (line and line['external']) or '0'
     cells = [cell.strip() for cell in external.split(',')]
     return all(

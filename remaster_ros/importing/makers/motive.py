@@ -48,10 +48,11 @@ def _likeliness(kind: str) -> int:
 
 
 def read(text: str) -> NamedColumns | None:
-    """Columns of a take; None for other text. Raises InputError for a damaged one.
+    """Columns of a take exported by OptiTrack Motive; None for other text.
 
-    Frame, time, and position (and quaternion) of each asset. Markers without a label are put
-    together to moving ones, with notes; if that fails, InputError is raised, too.
+    Frame, time, and position (and quaternion) of each asset. If all markers are without a
+    label, their pieces are put together to moving markers, with notes. Raises InputError for a
+    damaged take, or if that fails.
     """
     start = _START.match(text) or _HEADLESS.match(text)
     if start is None and _HEADLESS.match(text.partition('\n')[2]):
@@ -172,9 +173,10 @@ def read(text: str) -> NamedColumns | None:
 
 @dataclass(eq=False)
 class _Track:
-    """Pieces of one marker.
+    """Track of one marker over n frames, put together from pieces that Motive did not identify.
 
-    `places` is NaN, (n, 3), and `of`, the index of the piece, -1 if the marker was not seen.
+    `labels`: of the pieces; `places`: positions, NaN where not seen, (n, 3); `of`: index of
+    the piece in each frame, -1 if the marker was not seen, (n,).
     """
 
     labels: list[str]
@@ -187,15 +189,19 @@ class _Track:
         return self.of >= 0
 
     def extent(self) -> float:
-        """Longest side of the box around the positions, in their unit; ValueError without any."""
+        """Longest side of the box around the seen positions, in the file's unit.
+
+        Raises ValueError if the marker was never seen.
+        """
         return float(np.ptp(self.places[self.seen], axis=0).max())
 
     def distance(self, places: FloatArray, time_s: FloatArray) -> float:
-        """Distance of a piece from this marker's seen or predicted position, in their unit.
+        """Distance of a piece from this marker's seen or predicted position, in the file's unit.
 
-        `places`: of the piece, NaN where not seen, (n, 3); `time_s`: of the frames, (n,). The
-        median where both are seen, else at the piece's first frame, less twice the way at the
-        marker's last speed. Infinite if the piece begins over 0.5 s after the marker was lost.
+        `places`: positions of the piece, NaN where not seen, (n, 3); `time_s`: of the frames,
+        (n,). The median over frames in which both are seen; else from the marker's last
+        position to the piece's first, less twice the way that the marker makes meanwhile at
+        its last speed. Infinite if the marker was lost over 0.5 s before.
         """
         seen = np.isfinite(places[:, 0])
         both = seen & self.seen
@@ -215,9 +221,9 @@ class _Track:
         )
 
     def add(self, label: str, places: FloatArray) -> None:
-        """Add a piece in the frames in which the marker was not seen, in place.
+        """Add a piece, in place, in the frames in which the marker was not seen before.
 
-        `label`: of the piece; `places`: NaN where not seen, (n, 3).
+        `label`: of the piece; `places`: its positions, NaN where not seen, (n, 3).
         """
         fresh = np.isfinite(places[:, 0]) & ~self.seen
         self.places[fresh] = places[fresh]
@@ -231,11 +237,12 @@ def _moving_tracks(
     commas: bool,
     unit: str,
 ) -> tuple[list[_Track], int]:
-    """Tracks of the markers that move, joined from their pieces.
+    """Tracks of the moving markers, joined from pieces, and the number of pieces left out.
 
-    Motive gives a marker that it lost a new number. A piece belongs to the marker that was last
-    seen, or is seen, in the same place. Empty if several markers remain and none is seen most of
-    the time. Last result: the number of pieces left out.
+    Motive gives a marker that it lost a new number. A piece belongs to the marker that was
+    last seen, or is seen, within 10 mm of it. Of several markers only those seen in over half
+    of the frames are kept, which may be none. `groups`: label -> columns of a piece in
+    `table`; `commas`: decimal commas; `unit`: of length, '' for m.
     """
 
     def column(i: int) -> FloatArray:

@@ -20,7 +20,7 @@ _FEWEST_AXES, _MOST_AXES = 2, 100
 
 @dataclass(frozen=True, eq=False)
 class NamedColumns:
-    """Named columns of a text, with the line of each row."""
+    """Named columns of a file, with cells as text and the line of each row."""
 
     # Format of the file in words; '' for a plain table.
     kind: str
@@ -50,9 +50,9 @@ class NamedColumns:
 
 
 def unexpected(number: int, line: str, expected: str) -> InputError:
-    """InputError on a line, to be raised, with its number, content and what is expected there.
+    """Return an InputError on a line, with its number, its content and what is expected there.
 
-    Only the first 60 letters are shown.
+    Only the first 60 letters of the line are shown.
     """
     text = line.strip()
     shown = text if len(text) <= SHOWN else f'{text[:SHOWN]}…'
@@ -66,10 +66,11 @@ def first_names(names: Sequence[str]) -> str:
 
 
 def leading_column(labels: list[str]) -> tuple[list[str], list[str]]:
-    """Name and cells of a column of the texts before the numbers of each line.
+    """Name and cells of a first column made of the text before the numbers of each line.
 
-    The name is ['time'] if all texts have a time, ['name'] if over half of them are different,
-    else [] with the texts as cells.
+    `labels`: these texts. The name is ['time'] if each has a time, which are the cells then;
+    else the cells are the texts, and the name is ['name'] if over half of them are different,
+    else [] (no column).
     """
     stamps = [_TIME.search(words) for words in labels]
     if all(stamps):
@@ -88,10 +89,11 @@ def axes_in_order(
 ) -> NamedColumns:
     """Joint positions as columns: their names, if any has one, then the axes in order.
 
-    Each position in `found` is its line, name ('' for none) and axes such as ``A1``. `letters` are
-    that of the arm's axes, then those of external axes, which are left out if they stay at 0;
-    `unit`: of the arm's axes. Raises InputError if a position lacks an axis of the arm, or axes
-    are not numbered from 1, fewer than 2 or more than 100.
+    Each position in `found` is its line, name ('' for none) and axes, such as ``A1`` -> number
+    as text. `letters`: first that of the arm's axes, then those of external axes, which are
+    left out if they stay at 0; `unit`: of the arm's axes; `kind`: of the file, in words.
+    Raises InputError if a position lacks an axis of the arm, or axes are not numbered from 1,
+    fewer than 2 or more than 100.
     """
     every = {axis for _, _, values in found for axis in values}
     if len(every) > _MOST_AXES:

@@ -20,11 +20,11 @@ _LIMIT = 64 * 1024**2
 
 
 def read(data: bytes) -> dict[str, str] | None:
-    """Arrays of a file as tab-separated text, by name; None for other files.
+    """Arrays of a .npy or .npz file as tab-separated text, by name; None for other files.
 
-    Arrays with equally many rows are columns of one text, by the name of the first; those of fewer
-    than two are left out. The name is '' for a single array. Raises InputError for damaged files,
-    arrays of over 512 MiB, or arrays that are no table.
+    Arrays with equally many rows are columns of one text, by the name of the first; those of
+    fewer than two rows are left out. The name is '' for a .npy file. Raises InputError for
+    damaged files, arrays of over 512 MiB, or arrays that are no table.
     """
     if data.startswith(b'\x93NUMPY'):
         array = _loaded(data, '')
@@ -58,7 +58,7 @@ def read(data: bytes) -> dict[str, str] | None:
 
 
 def _loaded(data: bytes, where: str) -> NDArray[Any]:
-    """Array of bytes in NumPy's format. Raises InputError, beginning with `where`, if damaged."""
+    """Array in the bytes of a .npy file; raises InputError, beginning with `where`, if damaged."""
     try:
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as error:

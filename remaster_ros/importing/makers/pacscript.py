@@ -21,9 +21,10 @@ _FEWEST, _MOST = 3, 8
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a PacScript program (Denso); None for other text.
+    """Joint positions of a PacScript program (Denso), degrees; None for other text.
 
-    Raises InputError for a malformed or cut statement, or a program without joint positions.
+    Cartesian positions are left out, with a note. Raises InputError for a malformed or cut
+    statement, or a program without joint positions.
     """
     if not re.search(
         r'^[^\S\n]*(?:let\s+)?J\[\s*\w+\s*\]\s*=\s*J?\s*\(', text, re.MULTILINE | re.I
@@ -62,7 +63,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _is_cut(code: str, line: str) -> bool:
-    """Whether a comment begins within a position, because a letter is lost or foreign."""
+    """Whether a comment begins within an assignment to a joint position, which is then cut off.
+
+    `code`: the line up to the comment, which has unbalanced brackets then, or no value yet.
+    """
     return code != line and (
         any(code.count(a) != code.count(b) for a, b in ('[]', '()'))
         or bool(

@@ -22,11 +22,11 @@ _BODY = (*_AXES, 'Roll', 'Pitch', 'Yaw', 'Residual', *(f'Rot[{i}]' for i in rang
 
 
 def read(text: str) -> NamedColumns | None:
-    """Columns of a capture; None for other text.
+    """Columns of a capture exported by Qualisys; None for other text.
 
-    Time, position, mm, and the quaternion of bodies. Raises InputError, with the line, for missing
-    names or rate, rows of other lengths, times that do not increase, or matrices that are no
-    rotations.
+    Time, position of each marker or body, mm, and the quaternion of bodies. Raises InputError,
+    with the line, for missing names or rate, rows of other lengths, times that do not
+    increase, or matrices that are no rotations.
     """
     if _START.match(text) is None:
         return None

@@ -37,10 +37,10 @@ _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint targets of a module, degrees, or of a log; None for other text.
+    """Joint targets of a RAPID module (ABB, Rokae), degrees, or of a log; None for other text.
 
-    Cartesian targets are left out, with a note. Raises InputError, with the line, for text that
-    cannot be read, or if there are no joint targets.
+    Cartesian targets are left out, with a note. Raises InputError, with the line, for text
+    that cannot be read, or if there are no joint targets.
     """
     lower = text.lower()
     # Looking for words is much faster than for patterns, and logs are large.
@@ -100,9 +100,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _statements(text: str) -> list[tuple[int, str]]:
-    """Statements without comments, with the line, from 1, on which each begins.
+    """Statements of a RAPID module without comments, each with the line, from 1, where it begins.
 
-    Lines of the language that end without a semicolon are left out.
+    Lines that end without a semicolon, such as ``PROC main()``, are left out, but for targets
+    in a log or of Rokae.
     """
     statements: list[tuple[int, str]] = []
     parts: list[str] = []

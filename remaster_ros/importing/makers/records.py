@@ -26,13 +26,13 @@ _SECONDS = (('sec', 'nanosec'), ('secs', 'nsecs'), ('sec', 'nsec'), ('s', 'ns'))
 
 
 class Mapping(dict[str, Any]):
-    """Keys and values, with the line on which they begin."""
+    """JSON object or YAML mapping, with the line on which it begins."""
 
     line = 0
 
 
 class Items(list[Any]):
-    """Values in order, with the line on which they begin."""
+    """JSON array or YAML sequence, with the line on which it begins."""
 
     line = 0
 
@@ -41,10 +41,11 @@ Record = tuple[int, dict[str, str]]
 
 
 def read(kind: str, data: Any) -> NamedColumns | None:
-    """Rows of nested data, whose scalars are text; None if it has no records.
+    """Records in nested data (JSON, YAML) as rows of named columns; None if there are none.
 
-    `kind`: of the file, for messages. None also for records of one cell or more than 500. Raises
-    InputError, with the line, if a record has other keys than most.
+    `kind`: of the file, for messages; `data`: Mapping, Items or scalars as text. None also for
+    fewer than two records, or records of one cell or more than 500. Raises InputError, with
+    the line, if a record has other keys than most.
     """
     found, names, dropped_keys = _records(data, ())
     if len(found) < _FEWEST_RECORDS:
@@ -80,9 +81,10 @@ def read(kind: str, data: Any) -> NamedColumns | None:
 def _records(
     data: Any, names: Sequence[str]
 ) -> tuple[list[tuple[int, Any]], Sequence[str], list[str]]:
-    """Records in nested data with their lines, names of joints, and keys that are left out.
+    """Records in nested data, each with its line, then names of joints, and keys left out.
 
-    `names`: of joints, if known. [] if there are no records.
+    `names`: of joints, if known from above. The records are [] if there are none; a list of
+    joint names in the data replaces `names`.
     """
     if isinstance(data, Items):
         if _are_records(data):
@@ -137,7 +139,7 @@ def _records(
 
 
 def _weight(columns: dict[str, Items], size: int) -> int:
-    """Number of cells in one record of the columns that have `size` values."""
+    """Number of cells in one record of those columns that have `size` values."""
     return sum(
         len(value[0]) if isinstance(value[0], (Items, Mapping)) else 1
         for value in columns.values()
@@ -161,9 +163,10 @@ def _named(header: Sequence[str], row: Items) -> Mapping:
 
 
 def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
-    """Records of a data frame written by column and key, row and key, or row and column.
+    """Records of a mapping of mappings, each with its line: a data frame, or named records.
 
-    With their lines; [] if the mappings in `data` do not have equal keys, or are points.
+    A data frame may be by column and row, or by row and column; a key of a record becomes its
+    ``name``. [] if the mappings in `data` do not have equal keys, or are points (x, y, z).
     """
     inner = [tuple(mapping) for mapping in data.values()]
     if len({*inner}) != 1 or any(
@@ -230,9 +233,10 @@ def _cells(
 def _of_mapping(
     name: str, value: Mapping, names: Sequence[str], depth: int, line: int
 ) -> Iterator[tuple[str, str]]:
-    """Yield column and text of each scalar of a mapping.
+    """Yield column and text of each scalar of a mapping; arguments as of `_cells`.
 
-    A list of joint names in it labels the lists of numbers.
+    A list of joint names in it labels the lists of numbers, in place of `names`. Seconds and
+    nanoseconds become one number, in a column ending in ``[s]``.
     """
     for seconds, part in _SECONDS:
         if {*value} == {seconds, part} and all(str(item).isdigit() for item in value.values()):
@@ -255,7 +259,10 @@ def _of_mapping(
 
 
 def _pose(cells: Sequence[Any]) -> list[float]:
-    """Position and quaternion x, y, z, w of sixteen numbers; [] if they are no pose."""
+    """Position and quaternion x, y, z, w of the sixteen numbers of a 4×4 matrix.
+
+    [] if they are not all numbers, or no rigid motion.
+    """
     if not all(NUMBER.fullmatch(str(cell)) for cell in cells):
         return []
     T = rigid(np.array(cells, float))

@@ -30,11 +30,11 @@ _DIGITS = re.compile(r'\d+(?:\.\d+)?')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joints of the replies, with their times; None for other text.
+    """Joints in a log of a controller's replies, with their times; None for other text.
 
     Replies of Cartesian poses, of errors, and other lines are left out, with notes. Raises
-    InputError, with the line, for several calls with joints, or lists of other lengths or not of
-    numbers.
+    InputError, with the line, for several calls with joints, or lists of other lengths or not
+    of numbers.
     """
     lines = [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
     seen = [line for _, line in lines[:_SEEN]]
@@ -95,7 +95,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _call(reply: re.Match[str]) -> str:
-    """Name of the call: the word behind the list, else the last before it, else ''."""
+    """Name of the call in a reply: the first word behind the list, else the last before it.
+
+    '' if there is neither.
+    """
     behind = _WORD.findall(reply['after'])
     before = _WORD.findall(reply['before'])
     return behind[0] if behind else before[-1] if before else ''

@@ -15,7 +15,7 @@ _FIELD = re.compile(r'field\.(name|position)\[?(\d+)\]?')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joints or points of a printed topic; None for other text.
+    """Joints or points of a topic printed by ROS 1 or ROS 2 as CSV; None for other text.
 
     Raises InputError, with the line, if lines differ in names or number of cells.
     """
@@ -31,9 +31,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _with_header(head: list[str], lines: list[tuple[int, str]]) -> NamedColumns | None:
-    """Joints as ROS 1 prints them; None without time, or if names and positions do not match.
+    """Joint states as ROS 1 prints them; `head`: cells of the first line, `lines`: the others.
 
-    Raises InputError, with the line, if the names change.
+    None if there is no time, or names and positions do not match. Raises InputError, with the
+    line, if the names change.
     """
     columns = {cell: i for i, cell in enumerate(head)}
     names, positions = dict[str, int](), dict[str, int]()
@@ -73,7 +74,10 @@ def _names(cells: list[str]) -> list[str]:
 
 
 def _without_header(lines: list[tuple[int, str]]) -> NamedColumns:
-    """Joints as ROS 2 prints them. Raises InputError, with the line, if the names change."""
+    """Joint states as ROS 2 prints them, from lines (number, text).
+
+    Raises InputError, with the line, if the names change.
+    """
     first = _names([cell.strip() for cell in lines[0][1].split(',')])
     rows = []
     for number, line in lines:
@@ -105,7 +109,7 @@ def _is_place(cells: list[str]) -> bool:
 def _places(lines: list[tuple[int, str]]) -> NamedColumns:
     """Points of ``ros2 topic echo --csv``, m, with quaternions x, y, z, w if present.
 
-    Raises InputError, with the line, if one is of another kind than the first.
+    Raises InputError, with the line, if a line is no point or pose as the first one is.
     """
     rows = []
     width = len(lines[0][1].split(','))

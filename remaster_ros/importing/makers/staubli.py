@@ -17,7 +17,7 @@ _JOINT = re.compile(r'j\d+')
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joints of a data file of VAL 3, degrees; None for other text.
+    """Joints of a Staubli data file (VAL 3), degrees; None for other text.
 
     A joint that is not written is at 0. Elements of an array are named ``name[0]`` and so on.
     Raises InputError, with the line, for elements that cannot be read.

@@ -26,10 +26,12 @@ _EXPECTED = 'a list of the joints in rad, [0.1, -1.5, …],'
 
 
 def read(text: str) -> NamedColumns | None:
-    """Joint positions of a program in URScript, or of a .urp file, rad; None for other text.
+    """Joint positions in a URScript program or a .urp file, rad; None for other text.
 
-    Moves to Cartesian poses are left out, with a note. Raises InputError, with the line, for text
-    that cannot be read, a move to an unknown waypoint, or if there are no joint positions.
+    A row for each list of joint values, of a move or of a waypoint's definition; a move to a
+    named waypoint adds none. Moves to Cartesian poses are left out, with a note. Raises
+    InputError, with the line, for text that cannot be read, a movej to an unknown waypoint, or
+    if there are no joint positions.
     """
     if re.search(r'<JointAngles\b', text):
         return _waypoints(text)
@@ -130,9 +132,9 @@ def _waypoints(text: str) -> NamedColumns:
 
 
 def _joints(number: int, line: str, listed: str) -> dict[str, str]:
-    """Joint angles of a list, rad, as text, by J1, J2, …; d2r(…) is converted.
+    """Joint angles of a list such as ``0.1, d2r(30)``, rad, as text, by J1, J2, ….
 
-    Raises InputError, with the line, for other text.
+    Raises InputError, with the line, if a part is neither a number nor d2r(…).
     """
     values = {}
     for i, cell in enumerate(listed.split(','), 1):

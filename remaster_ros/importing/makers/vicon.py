@@ -21,11 +21,11 @@ _HEAD_LINES = 5
 
 
 def read(text: str) -> NamedColumns | None:
-    """Columns of a capture; None for other text.
+    """Columns of a capture exported by Vicon; None for other text.
 
-    Time from frame and rate, positions, and quaternions; other orientations and sections are left
-    out, with notes. Raises InputError, with the line, for missing sections, axes or units, rows of
-    other lengths, or frames that do not increase.
+    Time from frame and rate, positions, and quaternions, of the likeliest section; other
+    orientations and sections are left out, with notes. Raises InputError, with the line, for
+    missing sections, axes or units, rows of other lengths, or frames that do not increase.
     """
     if not re.search(r'^"?Frame"?[,;\t]"?Sub Frame"?[,;\t]', text, re.MULTILINE):
         return None
@@ -108,9 +108,9 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _name(text: str) -> str:
-    """Name of an object without the kind of its measurement, and without its repetition.
+    """Name of an object in a header: ``Tool`` of ``Global Angle Tool:Tool``.
 
-    ``Tool`` of ``Global Angle Tool:Tool``; ``A:B`` stays.
+    The kind of measurement and the repetition of the name are taken off; ``A:B`` stays.
     """
     text = re.sub(r'^Global Angle (?:\(.*?\) )?', '', text)
     subject, sign, object_name = text.partition(':')

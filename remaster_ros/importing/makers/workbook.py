@@ -49,7 +49,10 @@ def read(data: bytes) -> dict[str, str] | None:
 
 
 def _sheets(parts: zipfile.ZipFile) -> dict[str, str] | None:
-    """Visible sheets of a zip archive; None if it holds arrays of NumPy."""
+    """Visible sheets of a workbook's archive, name -> tab-separated text.
+
+    None if it holds arrays of NumPy instead. Raises InputError for another or damaged archive.
+    """
     names = {*parts.namelist()}
     if 'xl/workbook.xml' not in names:
         if any(name.endswith('.npy') for name in names):
@@ -98,7 +101,7 @@ def _parsed(parts: zipfile.ZipFile, name: str) -> ElementTree.Element:
 
 
 def _each(element: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    """Elements of a name in any namespace, at any depth: strict workbooks have another one."""
+    """Elements with a name, without its namespace, at any depth below an element."""
     return (node for node in element.iter() if _name(node) == name)
 
 
@@ -222,7 +225,7 @@ def _with_decimal_points(grid: Grid, texts: set[tuple[int, int]]) -> Grid:
 
 
 def _as_text(grid: Grid) -> str:
-    """Tab-separated line for each row of the sheet from 1 on, without empty columns."""
+    """Text of a sheet: a tab-separated line for each row from 1 on, without empty columns."""
     columns = sorted({column for row in grid.values() for column in row})
     text = io.StringIO()
     writer = csv.writer(text, delimiter='\t', lineterminator='\n')

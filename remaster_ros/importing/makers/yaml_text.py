@@ -22,10 +22,10 @@ _SEEN, _SHARE = 50, 0.7
 
 
 def read(text: str) -> NamedColumns | None:
-    """Records of YAML; None for other text.
+    """Records of YAML; None for text of which most lines are not nested YAML.
 
-    Raises InputError, with the line, for damaged YAML, keys that are there twice, or YAML without
-    records of equal keys.
+    Raises InputError, with the line, for damaged YAML, a key given twice, records of unequal
+    keys, or nested YAML without a list of records.
     """
     if not _START.match(text):
         return None
@@ -61,9 +61,11 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _plain(node: yaml.Node | None, budget: list[int], depth: int) -> Any:
-    """Node as text, Items or Mapping, each with its line.
+    """YAML node as text, `Items` or `Mapping`, the latter two with their line.
 
-    `budget` has the number of nodes that may still be expanded: aliases of aliases multiply.
+    `budget`: a list with the number of nodes that may still be expanded, which is counted down
+    in place: aliases of aliases multiply. Raises InputError if it is used up, or a key is
+    given twice.
     """
     budget[0] -= 1
     if budget[0] < 0:

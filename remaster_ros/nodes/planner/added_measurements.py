@@ -26,9 +26,9 @@ DISCOVER = '/remaster/discover'
 
 
 class AddedMeasurements:
-    """Decides from the optimizer's discovery which measurements are added to a collection.
+    """Decides which measurements are added to a complete collection to separate causes.
 
-    ``discovery``: its folder; '' for no additions.
+    ``discovery``: folder of the optimizer's discovery, with the causes; '' for no additions.
     """
 
     def __init__(
@@ -38,10 +38,12 @@ class AddedMeasurements:
         self._journal, self._tours = journal, tours
 
     def next_plan(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
-        """Return why nothing is added, and a function that plans new additions, if any.
+        """Return why no new measurements are added, and the function that plans them, or None.
 
-        The reason is '' if measurements are added, and None if the collection is not complete.
-        ``state``: the planner's; ``under_way``: whether additions are being measured already.
+        The reason is '' if measurements are added, or were and are under way (no function
+        then); None if the collection is not complete. ``state``: of the planner's run;
+        ``under_way``: whether additions are being measured already. The function takes the
+        registrations, sensor -> (4, 4), and returns the tour.
         """
         if state != 'complete':
             return '' if under_way else None, None
@@ -72,7 +74,7 @@ class AddedMeasurements:
         return hashlib.sha256(rows).hexdigest()
 
     def _added_so_far(self) -> int:
-        """Return the number of configurations that the tours of additions so far have to fit."""
+        """Return the number of configurations to fit in all tours of additions so far."""
         return sum(tour.to_fit for tour in self._journal.tours if tour.begin_at)
 
     def _plan(
@@ -88,9 +90,10 @@ class AddedMeasurements:
         return self._tours.separating_tour(T_R_N, causes, rows, previous, most)
 
     def describe_tour(self, tour: Tour) -> str:
-        """Return a tour's counts and its expected precision in one line.
+        """Return a tour's counts of poses and its expected precision in one line.
 
-        Of additions the separations (`describe`); no precision without an optimal design.
+        For a tour of additions, in place of the precision, how far it separates the causes
+        (`describe`). No precision without an optimal design.
         """
         design = self._tours.design_result
         expected = '' if design is None else design.describe()
@@ -99,7 +102,10 @@ class AddedMeasurements:
         return '; '.join(filter(None, (tour.describe(), expected)))
 
     def describe(self) -> str:
-        """Return how far the additions separate causes from look-alikes; '' if unplanned."""
+        """Return as text how far the additions separate causes from their look-alikes.
+
+        Separations are in standard deviations, before and expected. '' if none were planned.
+        """
         design = self._tours.separating_design
         if design is None:
             return ''

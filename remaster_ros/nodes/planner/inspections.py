@@ -40,7 +40,7 @@ LONGEST_WALL_S = 600.0
 
 @dataclass(frozen=True)
 class InspectionParameters:
-    """Parameters of inspections."""
+    """ROS parameters of inspections."""
 
     compensation: str = parameter(
         '',
@@ -64,7 +64,7 @@ class InspectionParameters:
 
 
 class Inspections:
-    """Plans the visits of inspections, and starts their evaluation."""
+    """Plans the visits of inspections (verify, check), and starts their evaluation."""
 
     def __init__(
         self,
@@ -83,7 +83,7 @@ class Inspections:
 
     @property
     def page(self) -> Path:
-        """Path of the page with the trend of all checks, beside the session."""
+        """Path of the HTML page with the trend of all checks, next to the session's folder."""
         session = self._session.absolute()
         return session.with_name(f'{session.name}.check.html')
 
@@ -169,9 +169,9 @@ class Inspections:
             self._background.submit(lambda: _output_of_verb(command), self._on_answer)
 
     def _on_answer(self, answer: str | Exception) -> None:
-        """Publish the verdict and log it with its warnings; log and keep why there is none.
+        """Publish and log the verdict, with its warnings; without one log and keep the reason.
 
-        ``answer``: JSON of the verb, or the exception.
+        ``answer``: JSON output of the evaluation, or its exception, the reason for `trouble`.
         """
         if isinstance(answer, Exception):
             self.trouble = f'not judged: {answer}'

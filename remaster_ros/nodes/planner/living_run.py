@@ -36,7 +36,10 @@ def new_token() -> str:
 
 
 class LivingRun:
-    """A run of this process; its liveness file is outside of every session."""
+    """A collection run of this planner's process, and its liveness file.
+
+    ``token``: of the run. The file is outside of every session.
+    """
 
     def __init__(self, token: str) -> None:
         self.token = token
@@ -44,9 +47,9 @@ class LivingRun:
         self.stay_alive()
 
     def stay_alive(self) -> None:
-        """Renew the liveness file, at most every `ALIVE_S`; if that fails, no planner resumes.
+        """Renew the liveness file, at most every `ALIVE_S`.
 
-        Nothing is raised then.
+        A file that cannot be written is ignored; no planner can resume the run then.
         """
         now = since_boot_s()
         if now - self._renewed < ALIVE_S:

@@ -28,7 +28,7 @@ from remaster_ros.session.cells.workcell import Workcell
 
 @dataclass(frozen=True)
 class Parameters(InspectionParameters):
-    """Parameters of the planner."""
+    """ROS parameters of the pose planner."""
 
     cell: str = parameter('demo', 'cell file: a path, or the name of a shipped one')
     optimization_candidates: int = parameter(
@@ -107,9 +107,10 @@ class Parameters(InspectionParameters):
     def tour_planner(
         self, cell: Workcell, chain: SerialChain, causes: Sequence[FoundCause]
     ) -> TourPlanner:
-        """Return the planner of the tours of a cell; ``causes``: to be separated.
+        """Return the tour planner of a cell by these parameters.
 
-        Raises InputError if what its sensors measure in motion is asked for, and they cannot.
+        ``causes``: to be separated from their look-alikes. Raises InputError if measuring in
+        motion is asked for (`moving_s`), and the sensors or the arm do not allow it.
         """
         scene = cell.planning_scene(chain, np.deg2rad(self.limit_margin_deg))
         counts = {
@@ -139,9 +140,9 @@ class Parameters(InspectionParameters):
         )
 
     def causes(self, joint_names: Sequence[str]) -> tuple[FoundCause, ...]:
-        """Return the causes that the plan has to separate, () if none are given.
+        """Return the causes that the plan has to separate from look-alikes; () if none are given.
 
-        Raises InputError as `read_causes`.
+        Read from the file of the parameter `separate`. Raises InputError as `read_causes`.
         """
         if not self.separate:
             return ()

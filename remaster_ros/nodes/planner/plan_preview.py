@@ -108,10 +108,10 @@ class PlanPreview(PlanConfirmation):
         return self.refusal()
 
     def _next(self, required: RequiredSensors) -> tuple[str, Tour | None]:
-        """Return identifier and tour of the next plan; the tour is None if it is not planned yet.
+        """Return identifier and tour of the plan that `TourProgress.next` would visit next.
 
-        The next plan is the one that `TourProgress.next` would visit. The identifier is the tour's
-        fingerprint, or `REGISTRATION`, or ``collection`` with a hash of the registrations.
+        The tour is None if it is not planned yet; the identifier is then `REGISTRATION`, or
+        ``collection`` with a hash of the registrations, else the tour's fingerprint.
         ``required``: sensors that must be registered before the collection.
         """
         T_R_N, tour = self._progress.T_R_N, self._memory.tour

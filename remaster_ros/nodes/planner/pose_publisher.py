@@ -25,7 +25,7 @@ from remaster_ros.planning.tour_order import PoseVisit
 
 
 class PosePublisher:
-    """Publishes poses with their joint solutions, and stops."""
+    """Publishes poses with their joint solutions, and requests to stop the arm."""
 
     def __init__(self, node: RemasterNode, chain: SerialChain) -> None:
         self._node, self._chain = node, chain

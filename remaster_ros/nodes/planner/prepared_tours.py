@@ -13,18 +13,18 @@ from remaster_ros.types import FloatArray
 
 
 class PreparedTours(TourPlanner):
-    """A `TourPlanner` of which one thread prepares curves and another asks for them, and waits."""
+    """A `TourPlanner` whose curves one thread prepares while another one waits for them."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._preparing = threading.Lock()
 
     def prepare(self) -> None:
-        """Choose the curves ahead, as `TourPlanner.prepare`."""
+        """Choose the curves ahead, as `TourPlanner.prepare`; `moving` waits meanwhile."""
         with self._preparing:
             super().prepare()
 
     def moving(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
-        """Return the tour of `TourPlanner.moving`, once the curves that are prepared are there."""
+        """Return the tour of `TourPlanner.moving`, after the end of a `prepare` under way."""
         with self._preparing:
             return super().moving(T_R_N)

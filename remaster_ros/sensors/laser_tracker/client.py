@@ -139,7 +139,10 @@ class LaserTrackerClient:
 
     @property
     def status(self) -> TrackerStatus:
-        """Last reported status of the instrument; `request_status` updates it."""
+        """Status that the instrument reported last; DISCONNECTED while there is no connection.
+
+        NOT_READY before the first report. It asks nothing; `request_status` does.
+        """
         return self._status if self.connected else TrackerStatus.DISCONNECTED
 
     @property
@@ -163,7 +166,7 @@ class LaserTrackerClient:
             raise
 
     def close(self) -> None:
-        """Close the connection; a command of another thread fails; again does nothing."""
+        """Close the connection; may be repeated. A command that another thread waits for fails."""
         self._link.close()
 
     def request_status(self) -> TrackerStatus:
@@ -201,9 +204,10 @@ class LaserTrackerClient:
         self._ask(Command.SET_SEARCH, s.search_radius_m, round(s.search_timeout_s * 1e3))
 
     def find_reflector(self) -> None:
-        """Search in the present direction, at the last measured distance or 3 m, and lock.
+        """Search for a reflector in the present direction, and lock it.
 
-        The radius is `search_radius_m`. It counts as a failed search if none is found.
+        At the last measured or given distance, or 3 m, within `search_radius_m`. Raises
+        LaserTrackerError if none is found; that counts as a failed search.
         """
         distance = self._distance_m or 3.0
         self._search(Command.FIND_REFLECTOR, distance, what='search for the reflector')
@@ -211,7 +215,8 @@ class LaserTrackerClient:
     def go_position(self, position: ArrayLike) -> None:
         """Turn to a position in the tracker's frame (m, (3,)), search there and lock.
 
-        Raises InputError too, if it is not three finite numbers.
+        Raises LaserTrackerError if no reflector is found there, InputError if the position is
+        not three finite numbers.
         """
         target = self._point(position)
         self._distance_m = float(np.linalg.norm(target))
@@ -220,16 +225,14 @@ class LaserTrackerClient:
     def ensure_locked(
         self, expected_position: ArrayLike | None = None, *, attempts: int = 3
     ) -> int:
-        """Lock the reflector if the beam is broken.
+        """Lock the reflector if the beam is broken; return the number of searches made.
 
-        The number of searches is returned, 0 if it was locked.
-
-        A busy instrument is waited for. Each attempt goes to the expected position, or, without
-        one, searches in the present direction. The locked reflector may be any within the search
-        radius: compare the reading with the expectation. ``expected_position``: in the tracker's
-        frame, m, (3,); ``attempts``: largest number of searches. Raises LaserTrackerError if the
-        last search failed too (with its status), or the connection is lost (at once; without a
-        status).
+        0 if it was locked. A busy instrument is waited for. Each attempt goes to the expected
+        position, or, without one, searches in the present direction. The locked reflector may
+        be any within the search radius: compare the reading with the expectation.
+        ``expected_position``: in the tracker's frame, m, (3,); ``attempts``: largest number of
+        searches. Raises LaserTrackerError if the last search failed too (with its status), or
+        the connection is lost (at once; without a status).
         """
         expected = None if expected_position is None else self._point(expected_position)
         failure: LaserTrackerError | None = None
@@ -247,12 +250,12 @@ class LaserTrackerClient:
         ) from failure
 
     def measure(self, timeout_s: float | None = None) -> MarkerReading:
-        """Measure the locked reflector once; reading with the stamp midway of the measurement.
+        """Measure the locked reflector once; its stamp is the time midway of the measurement.
 
         ``timeout_s``: None for the integration time and two reply time-outs. Raises
         LaserTrackerError: `Status.MEASUREMENT_STATUS_NOT_READY` without a lock,
-        `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is not
-        finite or beyond `FARTHEST_M`, or the settings were changed by another program.
+        `Status.SENSOR_NOT_STABLE` for a moving target, `Status.SERVER_BUSY`; or the result is
+        not finite or beyond `FARTHEST_M`, or the settings were changed by another program.
         """
         if timeout_s is None:
             timeout_s = self.settings.integration_s + 2 * self.settings.reply_timeout_s
@@ -300,10 +303,10 @@ class LaserTrackerClient:
             self._sleep(_WARM_UP_RETRY_S)
 
     def _search(self, command: Command, *values: Value, what: str) -> None:
-        """Send a command that searches for the reflector, and count it; counted again if it fails.
+        """Send a command that searches for the reflector; count the search, and its failure.
 
-        ``what``: the command in words. In time: `_SLEW_S` + ``search_timeout_s`` +
-        ``reply_timeout_s``.
+        ``command, values``: as of `TrackerLink.ask`; ``what``: the command in words. It may
+        take `_SLEW_S` + ``search_timeout_s`` + ``reply_timeout_s``.
 
         Raises LaserTrackerError if the instrument finds none in time.
         """
@@ -321,10 +324,10 @@ class LaserTrackerClient:
             raise
 
     def _try_search(self, expected: FloatArray | None) -> LaserTrackerError | None:
-        """Search once; the instrument's refusal is returned, a lost connection raised.
+        """Search once; return None if a reflector was found, or else the instrument's refusal.
 
-        At `expected`, m, (3,), or in the present direction for None; None if it found one. Waits
-        `_RETRY_S` after a refusal.
+        At `expected`, m, (3,), or in the present direction for None. Waits `_RETRY_S` after a
+        refusal. Raises LaserTrackerError, without a status, if the connection is lost.
         """
         try:
             if expected is None:
@@ -339,10 +342,10 @@ class LaserTrackerClient:
         return None
 
     def _wait_until_idle(self) -> TrackerStatus:
-        """Status of the instrument once it is no longer busy.
+        """Wait until the instrument is no longer busy, and return its status.
 
-        Raises LaserTrackerError if it is busy for longer than a turn, a search and a measurement
-        take.
+        Raises LaserTrackerError if it is busy for longer than a turn, a search and a
+        measurement take.
         """
         s = self.settings
         end = self._now() + _SLEW_S + s.search_timeout_s + s.integration_s
@@ -372,7 +375,10 @@ class LaserTrackerClient:
                 )
 
     def _changed(self, change: int) -> None:
-        """Record a status change; called in the reading thread. Unknown changes are ignored."""
+        """Process a status change, by its number; called in the reading thread.
+
+        A change of a setting has the settings checked again; unknown changes are ignored.
+        """
         if change in CHANGES_OF_READINGS:
             self._settings_checked = False
         status = _STATUS_OF_CHANGE.get(change)

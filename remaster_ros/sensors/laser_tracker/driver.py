@@ -50,7 +50,7 @@ class Parameters(LaserTrackerSettings, SensorParameters):
 
 
 class LaserTrackerDriver(TriggeredDriver):
-    """Driver of a laser tracker, see the module's docstring."""
+    """Driver of a laser tracker: one measurement of a reflector on request."""
 
     parameters_type = Parameters
     device = 'laser tracker'
@@ -86,9 +86,11 @@ class LaserTrackerDriver(TriggeredDriver):
         self.tracker.close()
 
     def prepare(self, expected: FloatArray | None) -> None:
-        """Search once if the beam is broken. Raises LaserTrackerError if none is found.
+        """Search for the reflector once if the beam is broken.
 
         ``expected``: where the reflector should be, m, (3,); None for where the beam points.
+
+        Raises LaserTrackerError if none is found.
         """
         if self.tracker.status is not TrackerStatus.READY:
             before, self._on = self._on, None
@@ -125,7 +127,7 @@ class LaserTrackerDriver(TriggeredDriver):
             self._narrow = True
 
     def _lock(self, expected: FloatArray | None) -> int:
-        """Lock the reflector if the beam is broken, by one search; number of searches made.
+        """Lock the reflector if the beam is broken, by one search; return the number of searches.
 
         ``expected``: where it should be, m, (3,), searched narrowly; None for where the beam
         points.
@@ -139,8 +141,9 @@ class LaserTrackerDriver(TriggeredDriver):
     def measure(self, expected: FloatArray | None) -> MarkerReading:
         """Measure the reflector at the expected position; see `TriggeredDriver.measure`.
 
-        `attempts` times at most. A reading further than `max_deviation_m` from there counts as
-        failed; the last failure is raised, a lost connection at once.
+        Up to `attempts` times, until a reading is within `max_deviation_m` of that position,
+        if one is given; the reflector is searched for first if the beam is broken. The last
+        failure is raised, a lost connection at once.
         """
         failure: DeviceError | None = None
         for _ in range(self.p.attempts):
@@ -164,7 +167,7 @@ class LaserTrackerDriver(TriggeredDriver):
         raise failure
 
     def state(self) -> SensorState:
-        """Lock, counts, and last temperature, °C, if there was one; always ready."""
+        """State of the sensor, always ready: lock, counts, and last temperature, °C, if any."""
         values: dict[str, Any] = {'lock': self.tracker.status.value, **self.tracker.counts}
         if self._temperature_c is not None:
             values['temperature_c'] = self._temperature_c

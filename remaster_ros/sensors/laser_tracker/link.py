@@ -100,7 +100,7 @@ class LaserTrackerError(DeviceError):
 
 @dataclass(frozen=True)
 class _Exchange:
-    """Command and the wait for its answer."""
+    """Command under way, and the time-out of its answer."""
 
     command: Command
     what: str
@@ -211,7 +211,7 @@ class TrackerLink:
     def ask(
         self, command: Command, *values: Value, timeout_s: float, what: str = ''
     ) -> tuple[Value, ...]:
-        """Send a command; the values of its reply are returned, in the order of its layout.
+        """Send a command; return the values of its reply, in the order of its layout.
 
         ``timeout_s``: by the injected clock, s, but at least 2 s of wall time (or itself, if
         shorter); ``what``: the command in words, for messages. Raises LaserTrackerError if the
@@ -223,11 +223,12 @@ class TrackerLink:
             return self._reply(exchange, values)
 
     def measure(self, timeout_s: float) -> tuple[Measurement, float]:
-        """Measure once: result, and this computer's time midway between start and result, s.
+        """Measure once; return the result, and the time midway from start to result, s.
 
-        ``timeout_s``: until the result, s of the link's clock.
+        The time is this computer's, by the link's clock. ``timeout_s``: until the result, s of
+        the link's clock.
 
-        Raises LaserTrackerError as `ask`.
+        Raises LaserTrackerError as `ask`, also if the result has an error as its status.
         """
         with self._exchange_of(Command.START_MEASUREMENT, 'measurement', timeout_s) as exchange:
             self._reply(exchange, ())
@@ -290,10 +291,10 @@ class TrackerLink:
             self._count_unexpected(event, exchange)
 
     def _next(self, exchange: _Exchange) -> Reply | ErrorReport | Measurement:
-        """Next packet that may belong to the exchange, waited for.
+        """Wait for the next packet that may belong to an exchange, and return it.
 
-        Raises LaserTrackerError if the connection is lost, or the exchange late (it is closed
-        then).
+        Raises LaserTrackerError if the connection is lost, or the exchange's time is over
+        without one (the connection is closed then).
         """
         with self._news:
             while not self._inbox:

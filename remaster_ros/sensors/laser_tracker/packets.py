@@ -34,7 +34,7 @@ class ProtocolError(Exception):
 
 
 class NeedData(Enum):
-    """Value of `PacketReader.next_event` while the next packet is not complete."""
+    """Type of `NEED_DATA`, which `PacketReader.next_event` returns for incomplete packets."""
 
     NEED_DATA = 'need data'
 
@@ -221,7 +221,10 @@ class PacketReader:
 
 
 def _unpack(layout: Struct, body: bytes, what: str) -> tuple:
-    """Values of a packet's body; ProtocolError for another length. `what`: name of the packet."""
+    """Numbers of a packet's body by its layout; ProtocolError for a body of another length.
+
+    ``what``: name of the packet, for the error.
+    """
     if len(body) != layout.size:
         raise ProtocolError(f'{what} packet with {len(body)} bytes of body, not {layout.size}')
     return layout.unpack(body)

@@ -210,9 +210,10 @@ class NatNetClient(MarkerFollower):
     ) -> None:
         """Decode one datagram and process it; drop a foreign one, count a malformed one.
 
-        Frames count from one source, answers from the command port only: another program on the
-        server's computer could send another version or another marker. ``received_s``: when it
-        came, s; ``from_data_socket``: else from the command socket.
+        Frames count from one source, answers from the command port only: another program on
+        the server's computer could send another version or another marker. ``received_s``:
+        when the datagram came, s; ``from_data_socket``: whether by the data socket, else by
+        the command socket.
         """
         looks_like_frame = datagram[:2] == _FRAME_ID
         is_answer = not from_data_socket and sender[1] == self._settings.command_port
@@ -243,9 +244,10 @@ class NatNetClient(MarkerFollower):
             self._take_answer(message)
 
     def _take_frame(self, frame: Frame, received_s: float, sender: Source) -> None:
-        """Hand on the samples of a frame of the believed source; a frame of another has none.
+        """Hand on the readings of a frame, if its source is the believed one.
 
         A changed bitstream has the server greeted again, a changed model requested again.
+        ``received_s``: when the frame came, s; ``sender``: its source.
         """
         samples = self._take_whole_frame(frame, received_s, sender)
         if sender != self._lock.source:
@@ -279,9 +281,10 @@ class NatNetClient(MarkerFollower):
                 self._status.server = None
 
     def _take_server(self, server: ServerInfo) -> None:
-        """Process an answer to CONNECT: request the model, negotiate a wanted bitstream.
+        """Process an answer to CONNECT: request the model, negotiate the bitstream if one is set.
 
-        Frames may get the lock from then on; without a wanted bitstream the server's own is read.
+        Frames may be believed (`SourceLock`) from then on; without a set bitstream the
+        server's own version is read.
         """
         self._status.server = server
         self._lock.answer()
@@ -306,10 +309,10 @@ class NatNetClient(MarkerFollower):
         self._send(natnet.encode_command_request(f'Bitstream,{natnet.format_version(wanted)}'))
 
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
-        """Process the answer to the request of `_negotiate`; None if it was refused.
+        """Process the answer to the request of `_negotiate`; None if the server refused it.
 
-        The version becomes the answered one, the wanted one for the code 0, else the server's own.
-        Ignored if no answer is awaited.
+        The version becomes the answered one, the wanted one for the code 0, else the server's
+        own. Ignored if no answer is awaited.
         """
         if self._status.server is None or self._status.version is not None:
             return

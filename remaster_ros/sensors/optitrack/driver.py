@@ -100,7 +100,11 @@ class OptiTrackDriver(StreamDriver):
         return MarkerReading(self._captured_s, sample.position, marker=sample.marker)
 
     def state(self) -> SensorState:
-        """State by the received and the missing frames; ready if only the marker is hidden."""
+        """State of the sensor by `MarkerFollower.diagnosis`, with counts of frames.
+
+        Ready without a fault, and with the fault 'marker': frames come, but without a usable
+        marker.
+        """
         status = self.client.status()
         diagnosis = self.client.diagnosis()
         values = {

@@ -124,7 +124,7 @@ class GateCounts:
 
 
 class MarkerGate:
-    """Gate for the readings of one marker; every other frame is counted with its reason."""
+    """Filter that takes one marker's readings from frames, and counts why others are dropped."""
 
     def __init__(self, choice: MarkerChoice, counts: GateCounts) -> None:
         self._choice = choice
@@ -143,7 +143,7 @@ class MarkerGate:
         return self._choice.lone_marker or self.counts.marker_id is not None
 
     def forget_assets(self) -> None:
-        """Discard the server's rigid bodies: the id is that of the choice, or unknown."""
+        """Discard the server's rigid bodies: the marker's id is that of the choice, or unknown."""
         self.counts.marker_id = None if self._choice.lone_marker else self._choice.marker_id
         self.counts.problem = '' if self.resolved else 'the server has not named its rigid bodies'
 
@@ -182,17 +182,17 @@ class MarkerGate:
         self.counts.last_reason = reason
 
     def begin_source(self) -> None:
-        """Compare later frames with none before: they are of another source."""
+        """Forget the frames before, as later ones are of another source."""
         self._last_number = None
         self._last_timestamp = -math.inf
         self._last_reading = None
         self._repeats = 0
 
     def admit(self, frame: Frame, received_s: float, ticks_per_s: int) -> MarkerSample | None:
-        """Reading in a frame, or None with the reason counted.
+        """Return the marker's reading in a frame; None if it is dropped, with the reason counted.
 
-        ``frame``: decoded; ``received_s``: time of arrival, s; ``ticks_per_s``: frequency of the
-        frame's stamps; 0 before NatNet 3.
+        ``frame``: decoded; ``received_s``: time of arrival, s; ``ticks_per_s``: frequency of
+        the frame's stamps; 0 before NatNet 3.
         """
         self.counts.frames += 1
         found = self._order(frame) or self._find(frame)
@@ -292,10 +292,9 @@ class MarkerGate:
         return None
 
     def _frozen(self, reading: MarkerSample) -> Dropped | None:
-        """`Dropped.FROZEN` if the position is that of many readings before, else None.
+        """`Dropped.FROZEN` if the position repeats the last readings to the last bit, else None.
 
-        From the repeat `FROZEN_FRAMES` on, to the last bit. Counts repeats: called once per
-        reading.
+        From the `FROZEN_FRAMES`-th repeat on. Counts repeats: called once per reading.
         """
         last = self._last_reading
         same = last is not None and np.array_equal(reading.position, last.position)

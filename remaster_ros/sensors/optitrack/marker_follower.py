@@ -295,7 +295,8 @@ class MarkerFollower(ABC):
     def start(self) -> None:
         """Open the sockets and begin; the client keeps trying until `stop`. Returns at once.
 
-        Raises DeviceError if the server's name is unknown, or a socket cannot be opened.
+        Raises DeviceError if the server's name is unknown, there is no route to it, or a
+        socket cannot be opened.
         """
         settings = self._settings
         self._status.server_ip = resolve(settings.server)
@@ -352,14 +353,17 @@ class MarkerFollower(ABC):
 
     @abstractmethod
     def _run(self) -> None:
-        """Work until `_stopping` is set."""
+        """Receive frames and hand on readings until `_stopping` is set; runs in the thread."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Close what is open."""
+        """Close the sockets that `_open` has opened; may be repeated."""
 
     def _is_foreign(self, address: str) -> bool:
-        """Whether the sender is not the server; counted and remembered."""
+        """Whether an address is not the server's; if so, count its datagram and remember it.
+
+        The first `FOREIGN_REMEMBERED` addresses are remembered, in the status.
+        """
         if address == self._status.server_ip:
             return False
         self._gate.drop(Dropped.FOREIGN)
@@ -368,16 +372,17 @@ class MarkerFollower(ABC):
         return True
 
     def _is_refused(self, source: Source) -> bool:
-        """Whether the source is a port of the server that is not believed; counted."""
+        """Whether `SourceLock` refuses a source (address, port); if so, count its datagram."""
         if not self._lock.is_refused(source, time.monotonic()):
             return False
         self._gate.drop(Dropped.FOREIGN)
         return True
 
     def _release_silent_source(self) -> bool:
-        """Release the lock after a silence of its source, with a warning; whether it was released.
+        """Believe no source any more if the believed one is silent; return whether that was so.
 
-        As `SourceLock.release_if_silent`: the server must answer before the next lock.
+        As `SourceLock.release_if_silent`, with a warning in the log: the server must answer
+        before another source is believed.
         """
         holder = self._lock.source
         if holder is None or not self._lock.release_if_silent(time.monotonic()):
@@ -390,7 +395,7 @@ class MarkerFollower(ABC):
         return True
 
     def _note_closed_port(self) -> None:
-        """Record whether the server's computer is running without its command port."""
+        """Set `port_closed` of the status: whether the server's computer has no command port."""
         self._status.port_closed = port_is_closed(
             self._status.server_ip, self._settings.command_port, encode_echo_request(0)
         )

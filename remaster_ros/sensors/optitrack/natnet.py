@@ -216,9 +216,10 @@ def encode_message(message: Message, version: Version) -> bytes:
 
 
 def decode_request(datagram: bytes) -> ClientRequest:
-    """Request in a client's datagram.
+    """Request in a client's datagram, by its message id, which may be unknown.
 
-    The length in its header is ignored, as clients get it wrong.
+    A CONNECT has the wanted version, a REQUEST its text, an ECHOREQUEST its clock. The length
+    in the header is ignored, as clients get it wrong.
 
     Raises ProtocolError if there is no header, or an ECHOREQUEST has no clock.
     """

@@ -105,7 +105,7 @@ class Reader:
 
     @contextmanager
     def bounded(self, size: int) -> Iterator[None]:
-        """Context with the end after the next `size` bytes; the cursor is behind them afterwards.
+        """Context in which the reader ends after the next `size` bytes; it is behind them at exit.
 
         Raises ProtocolError if fewer are left.
         """

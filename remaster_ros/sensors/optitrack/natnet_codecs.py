@@ -20,13 +20,13 @@ _COUNT_AND_SIZE = Struct('<2i')
 
 
 class Codec(ABC):
-    """Reader and writer of one kind of item."""
+    """Reader and writer of one kind of item in a NatNet datagram."""
 
     least: int  # Fewest bytes of an item
 
     @abstractmethod
     def read(self, reader: Reader) -> Any:
-        """Read an item; raises `ProtocolError` for invalid bytes."""
+        """Read an item, and move behind it; raises `ProtocolError` for invalid bytes."""
 
     @abstractmethod
     def skip(self, reader: Reader) -> None:
@@ -37,11 +37,11 @@ class Codec(ABC):
         """Bytes of an item; raises `ValueError` or `struct.error` if it does not fit."""
 
     def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
-        """Read consecutive items."""
+        """Read `count` consecutive items, a tuple of them; ProtocolError for invalid bytes."""
         return tuple([self.read(reader) for _ in range(count)])
 
     def skip_many(self, reader: Reader, count: int) -> None:
-        """Skip consecutive items."""
+        """Skip `count` consecutive items, each as by `skip`."""
         for _ in range(count):
             self.skip(reader)
 
@@ -52,14 +52,14 @@ def _same(item: Any) -> Any:
 
 
 def stepped_over(*_: Any) -> None:
-    """No value, for items that are written and skipped, but never kept."""
+    """Return None, as the record of items that are written and skipped, but never kept."""
 
 
 class Row(Codec):
-    """Numbers of a fixed layout.
+    """Codec of numbers of a fixed layout.
 
-    ``layout``: `struct` format, without the byte order; ``build``: from rows of numbers to items;
-    ``flatten``: from one item to its numbers.
+    ``layout``: `struct` format, without the byte order; ``build``: from rows of numbers to
+    items; ``flatten``: from one item to its numbers.
     """
 
     def __init__(
@@ -73,23 +73,23 @@ class Row(Codec):
         self._build, self._flatten = build, flatten
 
     def read(self, reader: Reader) -> Any:
-        """Read one row; ProtocolError beyond the end."""
+        """Read one item; ProtocolError beyond the end."""
         return self._build([reader.unpack(self.layout)])[0]
 
     def skip(self, reader: Reader) -> None:
-        """Skip one row."""
+        """Skip one item; ProtocolError beyond the end."""
         reader.skip(self.least)
 
     def write(self, item: Any) -> bytes:
-        """Bytes of one row; struct.error if a number does not fit."""
+        """Bytes of one item; struct.error if a number does not fit."""
         return self.layout.pack(*self._flatten(item))
 
     def read_many(self, reader: Reader, count: int) -> tuple[Any, ...]:
-        """Read rows at once."""
+        """Read `count` consecutive items, a tuple of them; ProtocolError beyond the end."""
         return tuple(self._build(reader.rows(self.layout, count)))
 
     def skip_many(self, reader: Reader, count: int) -> None:
-        """Skip rows at once."""
+        """Skip `count` consecutive items at once; ProtocolError beyond the end."""
         reader.skip(self.least * count)
 
 
@@ -102,7 +102,7 @@ def number(layout: str) -> Row:
 
 
 class _Text(Codec):
-    """UTF-8 text up to its NUL; bytes that are not UTF-8 become U+FFFD."""
+    """Codec of a UTF-8 text with its final NUL."""
 
     least = 1
 
@@ -132,10 +132,10 @@ QUATERNION = Row('4f')
 
 
 class Record(Codec):
-    """Consecutive items of different kinds.
+    """Codec of consecutive items of different kinds.
 
-    ``build``: from the items to the record; ``parts``: codecs of the items; ``flatten``: from the
-    record to the items; a named tuple is its own items.
+    ``build``: from the items to the record; ``parts``: codecs of the items; ``flatten``: from
+    the record to the items; a named tuple is its own items.
     """
 
     def __init__(
@@ -152,18 +152,18 @@ class Record(Codec):
         return self._build(*[part.read(reader) for part in self._parts])
 
     def skip(self, reader: Reader) -> None:
-        """Skip the items."""
+        """Skip the items, each by its codec."""
         for part in self._parts:
             part.skip(reader)
 
     def write(self, item: Any) -> bytes:
-        """Write the items in their order."""
+        """Bytes of the record's items in their order; raises as `Codec.write`."""
         values = self._flatten(item)
         return b''.join(part.write(value) for part, value in zip(self._parts, values))
 
 
 class Columns(Codec):
-    """Count, then that number of items of the first kind, of the second kind, and so on.
+    """Codec of a count, then that number of items of the first kind, of the second, and so on.
 
     Read as a tuple of columns.
     """
@@ -175,12 +175,15 @@ class Columns(Codec):
         self._least_row = sum(kind.least for kind in kinds)
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
-        """Read the number of rows, then that many items of each kind; one tuple for each kind."""
+        """Read the number of rows, then that many items of each kind; one tuple for each kind.
+
+        Raises ProtocolError if the bytes cannot hold so many.
+        """
         count = reader.count(self._least_row)
         return tuple([kind.read_many(reader, count) for kind in self._kinds])
 
     def skip(self, reader: Reader) -> None:
-        """Skip the columns."""
+        """Skip the number of rows and the columns; ProtocolError beyond the end."""
         count = reader.count(self._least_row)
         for kind in self._kinds:
             kind.skip_many(reader, count)
@@ -195,7 +198,7 @@ class Columns(Codec):
 
 
 class List(Codec):
-    """Count and that number of items of one kind."""
+    """Codec of a count and that number of items of one kind."""
 
     least = _COUNT.size
 
@@ -203,31 +206,35 @@ class List(Codec):
         self.kind = kind
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
-        """Read the items."""
+        """Read the count and that many items; return the items, a tuple.
+
+        Raises ProtocolError if the bytes cannot hold so many.
+        """
         return self.kind.read_many(reader, reader.count(self.kind.least))
 
     def skip(self, reader: Reader) -> None:
-        """Skip the items."""
+        """Skip the count and the items; ProtocolError if the bytes cannot hold so many."""
         self.kind.skip_many(reader, reader.count(self.kind.least))
 
     def write(self, item: Sequence[Any]) -> bytes:
-        """Write the items."""
+        """Bytes of the count and the items; raises as `Codec.write` of the kind."""
         return _COUNT.pack(len(item)) + b''.join(map(self.kind.write, item))
 
 
 class SizedList(List):
-    """Count, size in bytes of all items, and the items.
+    """Codec of a count, the size in bytes of all items, and the items.
 
-    Additions of a newer server after skipped items are skipped as well. Items that are read have a
-    fixed layout and must fill the size: another size means another layout.
+    Additions of a newer server after skipped items are skipped as well. Items that are read
+    have a fixed layout and must fill the size: another size means another layout.
     """
 
     least = _COUNT_AND_SIZE.size
 
     def _head(self, reader: Reader) -> tuple[int, int]:
-        """Number of items and their size in bytes; ProtocolError if the rest is too short.
+        """Read the number of items and their size in bytes, and check both.
 
-        Also raised if the size is below that of so many of the smallest items.
+        Raises ProtocolError if the count is negative, the size is more than the remaining
+        bytes, or it is less than so many of the smallest items take.
         """
         count, size = reader.unpack(_COUNT_AND_SIZE)
         if count < 0 or not count * self.kind.least <= size <= reader.remaining_bytes:
@@ -237,7 +244,7 @@ class SizedList(List):
         return count, size
 
     def read(self, reader: Reader) -> tuple[Any, ...]:
-        """Read the items; ProtocolError if they do not fill the size exactly."""
+        """Read the items, a tuple; ProtocolError if they do not fill the size exactly."""
         count, size = self._head(reader)
         if size != count * self.kind.least:
             raise ProtocolError(
@@ -253,6 +260,6 @@ class SizedList(List):
         reader.skip(self._head(reader)[1])
 
     def write(self, item: Sequence[Any]) -> bytes:
-        """Write the items."""
+        """Bytes of count, size and items; raises as `Codec.write` of the kind."""
         body = b''.join(map(self.kind.write, item))
         return _COUNT_AND_SIZE.pack(len(item), len(body)) + body

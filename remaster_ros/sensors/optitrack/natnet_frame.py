@@ -65,7 +65,7 @@ class LabeledMarker(NamedTuple):
 
 
 class RigidBody(NamedTuple):
-    """Pose of a body or bone; stale or zero unless `params` has `TRACKING_VALID`."""
+    """Pose of a rigid body or bone; stale or zero unless `params` has `TRACKING_VALID`."""
 
     id: int
     position: Vec3

@@ -113,9 +113,9 @@ def encode_model_definition(definition: ModelDefinition, version: Version) -> by
 
 
 def _read(reader: Reader, version: Version) -> Description:
-    """Description at the reader's position.
+    """Read the description at the reader's position.
 
-    Raises ProtocolError for an unknown kind before 4.1.
+    From 4.1 on one of an unknown kind has its number alone; before, that raises ProtocolError.
     """
     kind = I32.read(reader)
     codec = _codecs(min(version, NEWEST_VERSION)).get(kind)

@@ -71,7 +71,10 @@ class NatNetClientBackend(MarkerFollower):
         self._refusal = ''
 
     def diagnosis(self) -> Diagnosis:
-        """Fault and remedy if readings are missing; 'version' for one that is not read."""
+        """Fault and remedy if readings are missing, `HEALTHY` if they are not.
+
+        The fault is 'version' if natnetclient cannot read the version that the server streams.
+        """
         return Diagnosis('version', self._refusal) if self._refusal else super().diagnosis()
 
     def _open(self) -> None:
@@ -107,7 +110,7 @@ class NatNetClientBackend(MarkerFollower):
             self._stopping.wait(POLL_S)
 
     def _greet(self) -> bool:
-        """Request the server's version with our decoder; whether natnetclient can read it.
+        """Request the server's version with our decoder; return whether natnetclient can read it.
 
         False also without an answer in `POLL_S`; `diagnosis` has the reason.
         """
@@ -135,10 +138,10 @@ class NatNetClientBackend(MarkerFollower):
         return not self._refusal
 
     def _follow(self, client: Any) -> None:
-        """Read frames until stopped or silent, or natnetclient cannot read them any more.
+        """Receive frames, and hand on the readings on which both decoders agree.
 
-        Silent for `silence_s`; `FAILURES_IN_A_ROW` failures of natnetclient. Readings on which
-        both decoders agree are handed on.
+        Returns when the client is stopped, after `silence_s` without a frame, and after
+        `FAILURES_IN_A_ROW` frames in a row that natnetclient cannot read.
         """
         self._name_assets({name: body.id for name, body in client.rigid_bodies.items()})
         source = client.data_sock._sock
@@ -174,9 +177,10 @@ class NatNetClientBackend(MarkerFollower):
                 self._compare(sample, theirs)
 
     def _compare(self, sample: MarkerSample, markers: tuple[LabeledMarker, ...] | None) -> None:
-        """Pass the reading on if natnetclient has the same one: same position, no flags.
+        """Hand a reading on if natnetclient has read the same marker position, without flags.
 
-        Else it is withdrawn (`Dropped.DISAGREEMENT`). ``markers``: None if natnetclient failed.
+        Else it is withdrawn (`Dropped.DISAGREEMENT`). ``markers``: those that natnetclient has
+        read from the datagram, None if it failed.
         """
         if markers is not None and any(
             marker.position == tuple(sample.position) and not marker.params
@@ -220,7 +224,7 @@ def _quiet_client() -> Any:
 
 
 class _Packet:
-    """Result of a socket as natnetclient expects it."""
+    """Received datagram in the form that natnetclient expects from its socket."""
 
     def __init__(self, datagram: bytes) -> None:
         self._packet = datagram

@@ -51,11 +51,11 @@ class _OtherSource:
 
 
 class SourceLock:
-    """Decision which source's frames are believed.
+    """Decision which source's (address and port) frames are believed: the one that has the lock.
 
-    Times are of one monotonic clock, s. ``silence_s``: longest time without a whole frame before a
-    source counts as silent. Attributes: ``source``: source with the lock, or None; ``taken``:
-    number of changes of the lock to another source.
+    Times are of one monotonic clock, s. ``silence_s``: longest time without a whole frame
+    before a source counts as silent. Attributes: ``source``: source with the lock, or None;
+    ``taken``: number of changes of the lock to another source.
     """
 
     def __init__(self, silence_s: float) -> None:
@@ -84,9 +84,10 @@ class SourceLock:
         return True
 
     def is_refused(self, source: Source, now_s: float) -> bool:
-        """Whether all datagrams of this source are ignored; records that it sent.
+        """Whether all datagrams of this source are ignored; notes that it sent.
 
-        They are while another source has the lock, and for `REFUSED_FOR_S` if it sent beside one.
+        They are while another source has the lock, and for `REFUSED_FOR_S` after the last one
+        if this source sent beside a source with the lock (for longer than `PROBATION_S`).
         """
         if source == self.source:
             return False
@@ -100,10 +101,10 @@ class SourceLock:
         return True
 
     def judge(self, source: Source, now_s: float) -> SourceVerdict:
-        """Verdict on a whole frame at `now_s`, s; its source gets the lock if it is due.
+        """Verdict on a whole frame at `now_s`, s, by its source, which may get the lock with it.
 
-        It is due for the last holder at once; for another one after an answer, with
-        `PROBATION_FRAMES` frames in `PROBATION_S` as the only source.
+        While no source has the lock, the last holder gets it back at once; another one after
+        an answer, with `PROBATION_FRAMES` frames in `PROBATION_S` or more as the only source.
         """
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN
@@ -140,14 +141,14 @@ class SourceLock:
         )
 
     def contestants(self, now_s: float) -> tuple[Source, ...]:
-        """Sources of which one could get the lock, if there are several; else none."""
+        """Sources that compete for the lock: () while a source has it, or for fewer than two."""
         candidates = self._candidates(now_s) if self.source is None else []
         return tuple(candidates) if len(candidates) > 1 else ()
 
     def _candidates(self, now_s: float) -> list[Source]:
-        """Sources that could get the lock: heard lately, and never beside another holder.
+        """Sources that could get the lock: heard lately, and never beside a source that had it.
 
-        Lately is in the last `silence_s`.
+        Lately is in the last `silence_s`; ``now_s``: s.
         """
         return [
             source
@@ -156,11 +157,11 @@ class SourceLock:
         ]
 
     def _note(self, source: Source, now_s: float) -> _OtherSource:
-        """Count a frame of a source without the lock, as its first one after a silence.
+        """Count a frame of a source that has not the lock; return the record of the source.
 
-        Beyond `REMEMBERED` sources, the one heard longest ago is removed, those never refused
-        first. ``now_s``: s of the clock of all calls. A silence is `silence_s`, or `REFUSED_FOR_S`
-        for a refused one.
+        The count begins anew after a silence of `silence_s`, or of `REFUSED_FOR_S` for a
+        refused source. Beyond `REMEMBERED` sources, the one heard longest ago is removed,
+        those never refused first. ``now_s``: s of the clock of all calls.
         """
         known = self._others.get(source)
         patience_s = REFUSED_FOR_S if known is not None and known.simultaneous else self._silence_s

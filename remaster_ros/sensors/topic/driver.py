@@ -46,7 +46,7 @@ FROZEN = 10
 
 
 class Sighting(NamedTuple):
-    """Content of a message about the marker."""
+    """What a message says about the marker: time, frame, position and orientation."""
 
     stamp_s: float  # Stamp of the header, s; 0 if the sending node has set none
     frame: str
@@ -121,7 +121,7 @@ class Parameters(SensorParameters):
 
 
 class TopicDriver(StreamDriver):
-    """Driver for a topic; the node subscribes and passes each message to `take`."""
+    """Driver of a sensor on a topic; the node subscribes and passes each message to `take`."""
 
     parameters_type = Parameters
     device = 'topic'

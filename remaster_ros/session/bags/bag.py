@@ -66,7 +66,7 @@ def live_name(topic: str) -> str:
 
 
 class BagMessage(NamedTuple):
-    """One recorded message."""
+    """One recorded message: topic, type, serialised bytes, and time of recording."""
 
     # Such as ``/joint_states`` and ``sensor_msgs/msg/JointState``.
     topic: str
@@ -130,10 +130,10 @@ class BagReader:
             ) from None
 
     def _types(self, msgtype: str) -> Typestore:
-        """Return the type store that knows a message type.
+        """Return a type store with a message type: Jazzy's, or Jazzy's and the bag's definitions.
 
-        Jazzy's own; with types of the bag's definitions added if the type is another one that the
-        bag defines. A type that neither knows gives Jazzy's.
+        The latter if the type is none of Jazzy's and the bag defines it. A type that neither
+        knows gives Jazzy's store, which lacks it.
         """
         if msgtype in jazzy_types().types or msgtype not in self._definitions:
             return jazzy_types()
@@ -152,9 +152,9 @@ class BagReader:
     def messages_of(self, file: FileMetadata, first_look: bool = False) -> Iterator[BagMessage]:
         """Yield the messages of one of `files`, in the order recorded.
 
-        With ``first_look`` the bytes cut off at its end are added to `torn_bytes`, with a warning.
-        `complete` becomes False for a file that a killed writer left. Raises InputError if the
-        file is unreadable or damaged.
+        `complete` becomes False for a file that a killed writer left; with ``first_look`` the
+        number of bytes cut off at the end of that file is added to `torn_bytes`, with a
+        warning. Raises InputError if the file is unreadable or damaged.
         """
         path = self.folder / file.name
         try:

@@ -31,7 +31,7 @@ class TopicMetadata:
 
 @dataclass
 class FileMetadata:
-    """A file of a bag in metadata.yaml; `first_ns` is None if it has no messages."""
+    """Name, first and last stamp and number of messages of a bag's file, as in metadata.yaml."""
 
     name: str
     first_ns: int | None = None

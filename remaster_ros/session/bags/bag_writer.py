@@ -206,7 +206,7 @@ class BagWriter:
         self._list_topics()
 
     def _list_topics(self) -> None:
-        """Write metadata.yaml with the topics, which players need, before the bag is closed.
+        """Write metadata.yaml with the topics so far: players need them also of an unclosed bag.
 
         If the disk is full, it is written later (``_metadata_waits``).
         """
@@ -225,9 +225,10 @@ class BagWriter:
 def recover_bag(folder: str | os.PathLike[str]) -> str:
     """Finish the bag of a killed writer, so that every MCAP and rosbag2 reader opens it.
 
-    The last file is written anew up to its last whole message; metadata.yaml and SHA256SUMS are
-    completed. Returns what was lost, as text; '' for nothing. A closed bag is unchanged. Raises
-    InputError if there is no bag or it is damaged, DiskError if the folder cannot be written to.
+    The last file is written anew up to its last whole message; metadata.yaml and SHA256SUMS
+    are completed. Returns what was lost, as text; '' for nothing. A bag whose files are all
+    complete and in SHA256SUMS is unchanged. Raises InputError if there is no bag or it is
+    damaged, DiskError if the folder cannot be written to.
     """
     folder = Path(folder)
     remove_leftovers(folder)
@@ -268,7 +269,7 @@ def _topics_of(reader: BagReader) -> dict[str, TopicMetadata]:
 
 
 def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
-    """Return the metadata of a topic with this number of messages.
+    """Return the metadata of a topic with `count` messages: type, type hash, whether latched.
 
     Raises InputError for a message type that is not one of ROS 2 Jazzy's.
     """
@@ -277,7 +278,10 @@ def _described(topic: str, msgtype: str, count: int = 0) -> TopicMetadata:
 
 
 def _remove_work(folder: Path) -> None:
-    """Remove the temporary folder of a recovery that is finished, or was killed."""
+    """Remove the temporary folder of a recovery, if there is one: it is finished, or was killed.
+
+    Raises DiskError if that fails.
+    """
     work = folder / _WORK
     with writing(work):
         if work.is_dir():

@@ -37,7 +37,7 @@ SENSORS = {
 
 @dataclass(frozen=True)
 class CellProposal:
-    """Contents of a new cell file."""
+    """Proposed values for a new cell file: arm, held joint, ranges of poses, sensors, meshes."""
 
     source: str
     urdf: str  # As the cell file is to name it
@@ -61,9 +61,9 @@ class CellProposal:
 
 
 def rail_advice(before: Sequence[str], base_link: str) -> str:
-    """Return advice, a sentence, to leave joints before the arm, such as a rail, where they are.
+    """Return a sentence that advises to leave joints before the arm, such as a rail, unmoved.
 
-    ``before``: names of these joints, at least one; ``base_link``: where the arm begins.
+    ``before``: names of these joints, at least one; ``base_link``: link where the arm begins.
     """
     return (
         f'{", ".join(before)} carries the whole arm, and is no joint of it here: leave it where '
@@ -156,7 +156,10 @@ def cell_text(p: CellProposal) -> str:
 
 
 def _held_lines(p: CellProposal) -> list[str]:
-    """Return the lines of the held joint: its name, values and reason; '' if none is held."""
+    """Return the YAML lines of the held joint: its name and values, with the reason as comment.
+
+    ``held_joint: ''`` if none is held.
+    """
     held_joint, chain = p.held, p.chain
     if held_joint.joint is None:
         text = (
@@ -189,7 +192,10 @@ def _held_lines(p: CellProposal) -> list[str]:
 
 
 def _sensor_lines(name: str, p: CellProposal) -> list[str]:
-    """Return the lines of a sensor of `SENSORS`, with the proposed place and viewing angle."""
+    """Return the YAML lines of a sensor, with its proposed place and viewing angle.
+
+    ``name``: a key of `SENSORS`.
+    """
     sensor, place, angle = SENSORS[name], p.sensor_R, p.max_angle_deg[name]
     why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'
     if angle > sensor.max_angle_deg:
@@ -207,7 +213,7 @@ def _sensor_lines(name: str, p: CellProposal) -> list[str]:
 
 
 def _mesh_lines(p: CellProposal) -> list[str]:
-    """Return the lines of the mesh path, with the meshes that were not found."""
+    """Return the YAML lines of the mesh path, with the missing meshes as comments."""
     lines = _comment('Folders in which the meshes are that the robot description names.')
     if p.missing_meshes:
         lines += _comment(

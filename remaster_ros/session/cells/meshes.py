@@ -56,9 +56,10 @@ def mesh_reader(urdf: Path, mesh_path: Sequence[Path] = ()) -> Callable[[str], F
 
 
 def find_mesh(name: str, urdf: Path, mesh_path: Sequence[Path]) -> Path:
-    """Return the file of a mesh by its name in a URDF; arguments as of `mesh_reader`.
+    """Return the path of a mesh file by its name in a URDF; arguments as of `mesh_reader`.
 
-    Raises InputError if there is none, or only outside of the folders that may be read.
+    Raises InputError if there is no such file, or only outside of the folders that may be
+    read.
     """
     folders: list[Path] = [*mesh_path]
     files = Confinement(urdf, mesh_path)
@@ -117,10 +118,10 @@ class MeshPart:
 
 
 def read_mesh_parts(path: Path) -> list[MeshPart]:
-    """Return the surfaces of a mesh file, one part for each colour, None included.
+    """Return the surfaces of a mesh file, one part for each colour and one for those without.
 
-    Parts with a vertex that is not finite are left out. Raises InputError if the file cannot be
-    read, or no triangle is left.
+    Parts with a vertex that is not finite are left out. Raises InputError if the file cannot
+    be read, or no triangle is left.
     """
     parts = _loaded(path, _parts, skip_materials=False)
     if not parts:
@@ -168,10 +169,11 @@ def _color(part: Any) -> tuple[float, float, float] | None:
 def _loaded(
     path: Path, take: Callable[[list[Any], float], Taken], *, skip_materials: bool
 ) -> Taken:
-    """Return the result of ``take`` on the parts of a mesh file and the length of its unit, m.
+    """Return the result of ``take``, called with the parts of a mesh file and its unit, m.
 
-    ``skip_materials``: do not read textures. Raises InputError if the format is not in `KINDS`,
-    the file is missing, over 64 MiB or damaged, or ``take`` fails.
+    ``take``: function of a list of trimesh objects and the length of their unit;
+    ``skip_materials``: do not read textures. Raises InputError if the format is not in
+    `KINDS`, the file is missing, over 64 MiB or damaged, or ``take`` fails.
     """
     kind = path.suffix.lower()
     if kind not in KINDS:

@@ -71,7 +71,7 @@ class Confinement:
                 self.add(package)
 
     def add(self, folder: Path) -> None:
-        """Allow the files below a folder."""
+        """Allow reading of the files below a folder."""
         self._folders.append(folder.resolve())
 
     def holds(self, path: Path) -> bool:
@@ -89,10 +89,10 @@ class Confinement:
 
 
 def _candidates(file: Path, package_path: Sequence[Path]) -> Iterator[Path]:
-    """Yield the folders in which, or as which, a package is searched.
+    """Yield folders that may be, or contain, a package that `file` names.
 
-    Those given, the sourced share folders, then those above the file up to one named src or share,
-    or to the one below the root.
+    First those of `package_path`, then the sourced share folders, then those above the file up
+    to one named src or share, or to the one below the root.
     """
     yield from package_path
     yield from sourced()

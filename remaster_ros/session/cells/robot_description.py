@@ -131,15 +131,18 @@ def _names_a_file(value: str) -> bool:
 
 
 def _from_here(value: str) -> str:
-    """Return the value of an argument, as an absolute path if it is a file.
+    """Return an argument's value: an absolute path if it names a file, else unchanged.
 
-    xacro would search it relative to the description.
+    xacro would search a relative path from the description, not from the working folder.
     """
     return str(Path(value).absolute()) if _names_a_file(value) else value
 
 
 def _too_slow(path: Path, after: str) -> InputError:
-    """Return the InputError of an expansion that is not done after a time, given as text."""
+    """Return the InputError for a xacro file whose expansion takes too long.
+
+    ``after``: time after which it was ended, as text.
+    """
     return InputError(
         f'{path}: xacro: it is not expanded after {after}; does a macro call itself, or double '
         'what it is given?'
@@ -156,11 +159,11 @@ def read_arm(
     trusted: bool = False,
     tables: Sequence[Path] = (),
 ) -> tuple[str, SerialChain]:
-    """Read a URDF, or expand a xacro, and find the arm in it.
+    """Read a URDF, or expand a xacro, and find the arm in it; return URDF text and arm.
 
-    ``base_link``, ``tip_link``: None for the likely ones; ``arguments, package_path, trusted``: as
-    of `read_description`; ``tables``: files whose column names decide which of several arms it is.
-    Raises InputError, naming the file and the remedy.
+    ``base_link``, ``tip_link``: ends of the arm, None to guess them; ``arguments,
+    package_path, trusted``: as of `read_description`; ``tables``: files whose column names
+    decide which of several arms it is. Raises InputError, naming the file and the remedy.
     """
     urdf = read_description(path, arguments, package_path, trusted=trusted)
     try:

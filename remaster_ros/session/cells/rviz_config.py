@@ -19,9 +19,9 @@ HEAD = (
 
 
 def rviz_config(cell: Workcell) -> str:
-    """Return an RViz configuration that shows everything the nodes of a cell publish.
+    """Return the text of an RViz configuration that shows what the nodes of a cell publish.
 
-    The shipped ``config/remaster.rviz`` with the base and the sensors of this cell.
+    The shipped ``config/remaster.rviz`` with the base frame and the sensors of this cell.
     """
     shipped = read_limited(config_path('remaster.rviz'), YAML_LIMIT, 'install the package again')
     content: Any = load_yaml(shipped.decode('utf-8'))

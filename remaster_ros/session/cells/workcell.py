@@ -72,7 +72,7 @@ KIND_OF_TOPIC: Mapping[str, SensorKind] = {'optitrack': 'camera', 'laser_tracker
 
 
 class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
-    """A sensor of a cell."""
+    """A sensor of a cell file: marker, topic, rough position, viewing angle, expected noise."""
 
     # Name of the marker that the sensor follows.
     marker: str
@@ -107,9 +107,10 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     source: str = ''
 
     def publish_anew(self, name: str) -> None:
-        """Set `topic` to NAME/marker, on which readings of a foreign node are published again.
+        """Set `topic` to NAME/marker, and `source` to the topic of the foreign node that it had.
 
-        The node's topic becomes `source`. Nothing happens without a `message_type`.
+        A node publishes the readings of `source` again on `topic`. ``name``: of the sensor.
+        Nothing happens without a `message_type`.
         """
         if self.message_type:
             self.source, self.topic = self.topic, f'{name}/marker'
@@ -146,7 +147,8 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     def problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         """First validation error of this sensor, prefixed by its YAML path; '' if valid.
 
-        ``where``: that path; ``markers``: those of the cell, name -> position.
+        ``where``: that path; ``markers``: markers of the cell, name -> position in the tool
+        frame, m.
         """
         if problem := self._marker_problem(where, markers):
             return problem
@@ -254,14 +256,20 @@ class CellToolBody(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def body(self, name: str, chain: SerialChain) -> Body:
-        """Return the body for collision checks, on the last joint; InputError as `shape`."""
+        """Return the body for collision checks, fixed to the last joint; InputError as `shape`.
+
+        ``name``: of the body, in messages; ``chain``: arm that carries the tool.
+        """
         turn = matrix_from_rpy(np.deg2rad(self.rpy_deg))
         T = chain.T_fixed[-1] @ transform(turn, np.array(self.center_m))
         return Body(name, len(chain), self.shape(), T, 'tool')
 
 
 class Workcell(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a cell file; config/cells/demo.yaml explains each key."""
+    """Content of a cell file: arm, markers, sensors, poses and obstacles.
+
+    config/cells/demo.yaml explains each key.
+    """
 
     robot: CellRobot
     markers: Annotated[dict[str, Triple], ON_TOOL]
@@ -329,9 +337,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return index (from 0) and values (rad or m) of the held joint, as a dict of one.
+        """Return index (from 0) -> values (rad or m) of the joint held in inverse kinematics.
 
-        None if there is none. Raises ValueError if the chain has no such joint.
+        A dictionary of one entry; None if no joint is held. Raises ValueError if the chain has
+        no such joint.
         """
         if not self.held_joint:
             return None
@@ -403,8 +412,8 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
     ) -> PlanningScene:
         """Return the planning scene of this cell, for poses and their joint solutions.
 
-        ``limit_margin_rad``: distance that solutions keep from joint limits; others, and
-        InputError, as of `collision_model`.
+        ``limit_margin_rad``: distance that solutions keep from joint limits, rad;
+        ``without_meshes``, and InputError, as of `collision_model`.
         """
         sights = [
             LineOfSight(
@@ -426,7 +435,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def design_settings(self) -> DesignSettings:
-        """Return the settings of the design, with the expected noise of the sensors."""
+        """Return the settings for the choice of poses, with the expected noise of the sensors."""
         expected = [
             ExpectedSensor(
                 name,
@@ -443,7 +452,7 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def _no_mesh(name: str) -> None:
-    """Return None for any mesh, which leaves it out."""
+    """Return None for any mesh name: the mesh is then left out of collision checks."""
 
 
 def config_path(name: str) -> Path:
@@ -510,7 +519,7 @@ def _check(path: Path, cell: Workcell, text: str) -> None:
 
 
 def _problem(cell: Workcell, chain: SerialChain) -> str:
-    """First contradiction between the keys of a cell file; '' if there is none."""
+    """First contradiction between the keys of a cell file, with the key; '' if there is none."""
     if cell.held_joint and cell.held_joint not in chain.joint_names:
         names = ', '.join(chain.joint_names)
         meant = did_you_mean(cell.held_joint, chain.joint_names)

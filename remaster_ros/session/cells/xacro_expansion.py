@@ -132,7 +132,11 @@ class Expansion:
             raise _refused(f'${{{expression}}}', str(error)) from None
 
     def _substituted(self, command: str) -> str:
-        """Return the value of ``$(…)``; raise InputError if it is not supported."""
+        """Return the value of ``$(…)``: of find, arg or eval.
+
+        ``command``: text between the brackets. Raises InputError for others, such as env, and
+        for an unknown package; XacroException for an unknown argument.
+        """
         name, *given = command.split() or ['']
         if name == 'find' and len(given) == 1:
             return self._find(given[0])
@@ -180,7 +184,7 @@ class Expansion:
         return str(folder.absolute())
 
     def _file(self, name: str) -> str:
-        """Return the path of a file named in the present one.
+        """Return the path of a file that the file being read names, relative to that file.
 
         Raises InputError if it lies outside the folders that may be read.
         """
@@ -196,7 +200,11 @@ class Expansion:
         return str(path)
 
     def _included(self, name: str, symbols: Any) -> Any:
-        """Return the files of <xacro:include>, which may have a wildcard, as xacro does."""
+        """Yield the files that an <xacro:include> names, which may have a wildcard, as xacro does.
+
+        ``name``: text with expressions, which are evaluated with ``symbols``. Raises
+        InputError if a file lies outside the folders that may be read.
+        """
         name = str(self._text(name, symbols))
         if not re.search(r'[*?[]', name):
             yield self._file(name)
@@ -240,7 +248,7 @@ class Expansion:
 
 
 def _here() -> str:
-    """Return the file that is being read."""
+    """Return the path of the file that xacro is reading."""
     return str(xacro.filestack[-1])
 
 
@@ -272,9 +280,9 @@ def _tokens(text: str, sep: str = ',; ', skip_empty: bool = True) -> list[str]:
 
 
 def _line(path: Path, error: BaseException) -> str:
-    """Return an error as one line, with the file and the remedy.
+    """Return an error of an expansion as one line of text, with the file and the remedy.
 
-    The text of an InputError among its causes is the line itself.
+    If the error, or one of its causes, is an InputError, its text unchanged.
     """
     inner: BaseException | None = error
     while inner is not None:
@@ -293,7 +301,11 @@ def _line(path: Path, error: BaseException) -> str:
 
 
 def serve(request: dict[str, Any]) -> None:
-    """Answer a request of `robot_description` on stdout: ``text``, or ``error`` with one line."""
+    """Expand a xacro file; print JSON with ``text``, or with ``error``, one line, to stdout.
+
+    ``request``: that of `robot_description`. Limits the processor time, and unless the file is
+    trusted the memory, of this process.
+    """
     path, trusted = Path(request['file']), request['trusted']
     resource.setrlimit(resource.RLIMIT_CPU, (request['cpu_s'], request['cpu_s']))
     if not trusted:

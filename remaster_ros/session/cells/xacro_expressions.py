@@ -35,7 +35,7 @@ class Function:
 
 
 class Namespace(dict[str, Any]):
-    """Names after a dot, such as ``math.pi``."""
+    """Values by name, used with a dot, such as ``math.pi``."""
 
 
 def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
@@ -152,7 +152,10 @@ class _Evaluation:
         return _bounded(operate(self._data(node.left), self._data(node.right)))
 
     def _of_BoolOp(self, node: ast.BoolOp) -> Any:
-        """Value of the part that decides an `and` or an `or`; later parts are not evaluated."""
+        """Value of the part that decides an `and` or an `or`, as in Python.
+
+        Later parts are not evaluated.
+        """
         ends = isinstance(node.op, ast.Or)
         value: Any = None
         for part in node.values:
@@ -244,7 +247,10 @@ def _bounded(value: Any) -> Any:
 
 
 def _count(value: Any, budget: int) -> int:
-    """Return the number of items left of a limit after a value; raise ExpressionError below 0."""
+    """Return ``budget`` less the number of items in a value, nested ones included.
+
+    A number or text has none. Raises ExpressionError if the budget falls below 0.
+    """
     if budget < 0:
         raise ExpressionError('a text or list that is too long')
     if isinstance(value, dict):
@@ -257,7 +263,10 @@ def _count(value: Any, budget: int) -> int:
 
 
 def _length(value: Any) -> int:
-    """Return the size of a number or text: bits, or characters and items; 0 for other values."""
+    """Return the size of a value: bits of an integer, or number of characters or items.
+
+    0 for other values.
+    """
     if isinstance(value, int):
         return value.bit_length()
     return len(value) if isinstance(value, str | list | tuple) else 0
@@ -286,7 +295,10 @@ def _power(left: Any, right: Any) -> Any:
 
 
 def _plus(left: Any, right: Any) -> Any:
-    """Sum of two numbers, or two texts or lists joined; ExpressionError for other values."""
+    """Sum of two numbers, or two texts, lists or tuples joined.
+
+    Raises ExpressionError for other values, TypeError for two different ones of these three.
+    """
     if isinstance(left, str | list | tuple) and isinstance(right, str | list | tuple):
         return operator.add(left, right)
     return _number(left) + _number(right)
@@ -317,7 +329,10 @@ def _replace(text: str, old: str, new: str) -> str:
 
 def _round(value: Any, ndigits: int = 0) -> Any:
     # That of a whole number works out 10 to the power of the digits.
-    """Return a rounded number, digits limited to 400; a whole number without digits."""
+    """Return a number rounded to `ndigits`, limited to ±400; to a whole number for 0.
+
+    Raises ExpressionError or TypeError for another value.
+    """
     return round(_number(value), max(-400, min(ndigits, 400))) if ndigits else round(value)
 
 

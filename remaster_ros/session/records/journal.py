@@ -68,10 +68,10 @@ class Journal:
         return os.fstat(self._file.descriptor).st_nlink
 
     def restore(self) -> None:
-        """Write every record again into the file's name, if the open file has lost that name.
+        """Write all records into a new file of this name, after the open file has lost the name.
 
-        Raises InputError if another process writes the file on the disk, DiskError if the disk is
-        full.
+        Raises InputError if another process writes the file on the disk, DiskError if the disk
+        is full.
         """
         write_atomically(self.path, self.content)
         self._file.close()

@@ -18,7 +18,7 @@ SPLITS = ('optimization', 'validation', 'reference')
 
 
 class RowKeys(NamedTuple):
-    """The fields of a row that the rules between rows depend on."""
+    """Fields of a row of observations.csv that the rules between rows depend on."""
 
     line: int
     observation: int
@@ -32,11 +32,11 @@ class RowKeys(NamedTuple):
 
 
 class SequenceRules:
-    """Rules between consecutive rows.
+    """Rules between the rows of observations.csv, and the rows accepted so far.
 
-    Observation numbers are unique and grow with time, time never runs backwards, a pose belongs to
-    one split and a configuration to one pose. The rows of a frame are of one configuration and of
-    different markers.
+    Observation numbers are unique and grow with time, time never runs backwards, a pose
+    belongs to one split and a configuration to one pose. The rows of a frame are of one
+    configuration and of different markers.
     """
 
     def __init__(self) -> None:
@@ -59,7 +59,7 @@ class SequenceRules:
         return rules
 
     def problem(self, row: RowKeys) -> str:
-        """Return what is wrong with the next row ("column …: …; remedy"); '' if valid.
+        """Return the rule that the next row breaks ("column …: …; remedy"); '' if valid.
 
         The row is not added: see `accept`.
         """

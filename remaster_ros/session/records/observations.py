@@ -57,7 +57,7 @@ _INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 
 
 class Table:
-    """Cells of a table as text by column name, with the places for error messages."""
+    """Cells of observations.csv as text, by column name; knows their lines for error messages."""
 
     def __init__(self, path: Path, names: list[str], lines: list[str], first_line: int) -> None:
         self.path = path
@@ -442,10 +442,11 @@ def _refuse_other_separators(header: str, path: Path) -> None:
 
 
 def _whole_lines(data: bytes, most: int) -> int:
-    """Return the number of bytes at the beginning that are whole lines.
+    """Return the number of bytes at the beginning that are whole lines, not torn by a crash.
 
-    The rows of a configuration, ``most`` at most, are written together: zeros in earlier rows are
-    not the effect of a crash, and are left for the reader to refuse.
+    Behind them are a line without its end, or last lines with zeros, as a power cut leaves
+    them. ``most``: largest number of rows of a configuration, which are written together:
+    zeros in earlier rows are not the effect of a crash, and are kept for the reader to refuse.
     """
     end = data.rfind(b'\n') + 1
     zero = data.find(b'\0')
@@ -457,7 +458,7 @@ def _whole_lines(data: bytes, most: int) -> int:
 def observations_of(
     m: Measurements, sensors: Sequence[str], markers: Sequence[str]
 ) -> Iterator[Observation]:
-    """Yield the rows of columns as observations, with None for NaN or -1.
+    """Yield each row of measurements as an `Observation`, with None for NaN or -1.
 
     ``sensors, markers``: names by index.
     """
@@ -574,11 +575,11 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
 
 
 def inverted_readings(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
-    """Return rows in which readings of sensors on the tool (indices) are inverted.
+    """Return rows in which the poses measured by sensors on the tool are inverted.
 
-    Poses of a fixed body in the sensor's frame become poses of the sensor in the body's frame, and
-    back. The same rows if there are none of these sensors. Raises InputError, which begins with
-    ``where``, if one has no orientation.
+    ``sensors``: indices of these. Poses of a fixed body in the sensor's frame become poses of
+    the sensor in the body's frame, and back. The same object if there are no rows of them,
+    else a copy. Raises InputError, which begins with ``where``, if one has no orientation.
     """
     mine = np.flatnonzero(np.isin(m.sensor, sensors))
     if len(mine) == 0:
@@ -601,7 +602,7 @@ def _not_among(key: str, names: Sequence[str]) -> str:
 
 
 def _numbers(values: FloatArray | Sequence[float] | None, count: int) -> list[str]:
-    """Return numbers as ``count`` cells, exact; empty for NaN, all of them for None."""
+    """Return numbers as cells of text, exact; '' for NaN. For None ``count`` empty cells."""
     if values is None:
         return [''] * count
     numbers = np.asarray(values, float).tolist()

@@ -37,14 +37,14 @@ ENOUGH = 'enough is known'
 
 
 class PlanHeader(msgspec.Struct, tag_field='kind', tag='plan'):
-    """First record: the identifier of the plan, and the settings that it depends on."""
+    """First record of a plan's journal: the plan's identifier, and settings that it depends on."""
 
     id: str
     settings: dict[str, Any]
 
 
 class TourRecord(msgspec.Struct, tag_field='kind', tag='tour'):
-    """A tour, as planned."""
+    """Record of a tour as planned: its poses with their solutions, and the order of visits."""
 
     plans: dict[str, Plan]
     in_order: bool
@@ -56,7 +56,10 @@ class TourRecord(msgspec.Struct, tag_field='kind', tag='tour'):
     begin_at: int
 
     def tour(self, chain: SerialChain, model: CollisionModel | None = None) -> Tour:
-        """Return the tour of this arm at its beginning, no pose visited; ``model``: obstacles."""
+        """Return the tour at its beginning, with no pose visited.
+
+        ``chain``: the arm; ``model``: arm with obstacles, None for none.
+        """
         return Tour(
             chain,
             self.plans,
@@ -70,7 +73,7 @@ class TourRecord(msgspec.Struct, tag_field='kind', tag='tour'):
 
 
 class VisitRecord(msgspec.Struct, tag_field='kind', tag='stop'):
-    """The next visit: a pose and its solutions, and those without a free path."""
+    """Record of a visit to a pose: its joint solutions, and those without a free path."""
 
     split: str
     index: int
@@ -78,27 +81,27 @@ class VisitRecord(msgspec.Struct, tag_field='kind', tag='stop'):
     unreached: tuple[int, ...] = ()
 
     def replay(self, tour: Tour) -> PoseVisit:
-        """Count the visit in a tour, and return it without paths, which are planned again."""
+        """Count this visit in a tour, in place; return it without paths, to be planned anew."""
         return tour.record_visit(self.split, self.index, self.ids, (), self.unreached)
 
 
 class RoundRecord(msgspec.Struct, tag_field='kind', tag='round'):
-    """A round of the references was requested."""
+    """Record of a request for a round of visits to the reference configurations."""
 
 
 class EnoughRecord(msgspec.Struct, tag_field='kind', tag='enough'):
-    """The precision goal is reached: no more poses to fit are visited."""
+    """Record that the precision goal is reached: no more poses to fit are visited."""
 
 
 class ExpectationRecord(msgspec.Struct, tag_field='kind', tag='expected'):
-    """Expected precision of a fit of the tour before it, at the noise of the cell file."""
+    """Record of the expected precision of a fit of the tour, at the noise of the cell file."""
 
     joint_std_rad: dict[str, float | None]
     tool_rms_m: float
 
 
 class StateRecord(msgspec.Struct, tag_field='kind', tag='state'):
-    """State of the planner, and the token of its run."""
+    """Record of the planner's state and the token of its run."""
 
     state: str
     run: str = ''
@@ -150,10 +153,10 @@ class RecordedPlan:
 
 
 def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
-    """Return the plan of a session's collection; None if it has none.
+    """Return the plan of a session's collection; None if it has none with poses to fit.
 
-    ``folder``: the session's; ``chain``: its arm. Raises InputError if plan.jsonl or the session's
-    journal is damaged, or the plan is of another version.
+    ``folder``: the session's; ``chain``: its arm. Raises InputError if plan.jsonl or the
+    session's journal is damaged, or the plan is of another version.
     """
     path = folder / PLAN
     if not path.exists():
@@ -255,7 +258,8 @@ class PlanJournal:
     def _open(self) -> Journal:
         """Open the file, and restore the state from its records; begin a plan in an empty file.
 
-        Raises InputError if another planner uses it, or it is damaged, or of other settings.
+        A last line cut off by a crash is dropped, and noted in `lost`. Raises InputError if
+        another planner uses the file, or it is damaged, or of other settings.
         """
         self._journal = Journal(self.path)
         self.lost = self._journal.lost
@@ -282,7 +286,11 @@ class PlanJournal:
         return self._journal
 
     def _refuse_other_settings(self, made: Mapping[str, Any]) -> None:
-        """Raise InputError for the first setting that differs from ``made``, those of the plan."""
+        """Raise InputError, which names the first such setting, if one differs from the plan's.
+
+        ``made``: settings that the plan was made with; one that is missing counts as
+        different.
+        """
         other = [name for name, value in self._settings.items() if made.get(name) != value]
         if other:
             name = other[0]
@@ -347,7 +355,7 @@ class PlanJournal:
         self._note(StateRecord(self.state, self.run))
 
     def request_reference_round(self) -> None:
-        """Request a round of the references, since a person has changed the setup.
+        """Request a round of visits to the reference configurations, as the setup was changed.
 
         Nothing happens without a tour or references.
         """
@@ -363,14 +371,17 @@ class PlanJournal:
             self._note(EnoughRecord())
 
     def open_visit(self, visit: PoseVisit) -> None:
-        """Begin a visit that the tour proposes, before the arm is sent there.
+        """Record a visit that the tour proposes as begun, before the arm is sent there.
 
-        It takes the place of one that is open.
+        It becomes `visit`, in place of the one before.
         """
         self._note(VisitRecord(visit.split, visit.index, visit.ids, visit.unreached))
 
     def record_state(self, state: str, run: str = '') -> None:
-        """Set state and token of the run; record them if they changed and there is a plan."""
+        """Set `state` and `run` (token of the run, '' for none), and record them.
+
+        They are recorded only if one has changed and there is a plan.
+        """
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):
             self._note(StateRecord(state, run))

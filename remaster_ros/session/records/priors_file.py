@@ -25,7 +25,7 @@ class _Strict(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _OffsetPrior(_Strict):
-    """Prior of an offset in degrees, or in mm for a prismatic joint."""
+    """Prior of a joint's zero-offset in degrees, or in mm for a prismatic joint."""
 
     mean_deg: Annotated[float | None, Bounds(-180.0, 180.0, 'degrees')] = None
     std_deg: Annotated[float | None, Bounds(0.0, 180.0, 'degrees', above=True)] = None
@@ -33,7 +33,7 @@ class _OffsetPrior(_Strict):
     std_mm: Annotated[float | None, Bounds(0.0, 1000.0, 'mm', above=True)] = None
 
     def known(self, where: str) -> tuple[float, float, bool]:
-        """Return mean and std, rad or m, and whether it is m.
+        """Return mean and standard deviation, rad or m, and whether they are in m.
 
         ``where``: beginning of the message. Raises InputError unless mean and std are given in
         exactly one of degrees and mm.
@@ -51,11 +51,15 @@ class _OffsetPrior(_Strict):
 
 
 class _MarkerPrior(_Strict):
+    """Prior of a marker's position in the tool frame, m, with its standard deviation per axis."""
+
     position_m: Annotated[Triple, Bounds(-10.0, 10.0, 'm')]
     std_m: Annotated[float, Bounds(0.0, 1.0, 'm', above=True)]
 
 
 class _StrictBase(BaseFrame, forbid_unknown_fields=True):
+    """Prior of a sensor's registration, with bounds of its numbers; unknown keys are refused."""
+
     translation_m: Annotated[Triple, Bounds(-1000.0, 1000.0, 'm')]
     std_m: Annotated[float, Bounds(0.0, 1000.0, 'm', above=True)]
     std_rad: Annotated[float, Bounds(0.0, np.pi, 'rad', above=True)]

@@ -126,9 +126,10 @@ def read_header(folder: Path) -> SessionHeader:
 def read_robot(
     folder: Path, header: SessionHeader, sums: Mapping[str, str] = MappingProxyType({})
 ) -> tuple[str, SerialChain]:
-    """Return the URDF text of a session and its chain; check its checksum if that is listed.
+    """Return the URDF text of a session and its arm.
 
-    Raises InputError if the file is missing, changed, or has no such arm.
+    ``sums``: checksums by file name; the URDF's is compared if it is listed. Raises InputError
+    if the file is missing, changed, or has no such arm.
     """
     path = folder / header.robot.urdf
     data = read_limited(path, URDF_LIMIT, 'robot.urdf in session.yaml names the URDF')

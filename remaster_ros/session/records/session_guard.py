@@ -23,7 +23,7 @@ Signature = tuple[int, int, int, int]
 
 
 def signature(path: Path) -> Signature | None:
-    """Return the signature of a file, which changes when it does; None if it is missing.
+    """Return device, inode, size and time of change of a file; None if it is missing.
 
     Raises DiskError if it cannot be looked up.
     """
@@ -36,7 +36,7 @@ def signature(path: Path) -> Signature | None:
 
 
 class SessionGuard:
-    """Compares the files of a folder with their last known state, or with their content.
+    """Detects changes by others to a session's files, by their last known state or their content.
 
     ``content``: returns the bytes that the writer put into the file of a name.
     """
@@ -50,7 +50,7 @@ class SessionGuard:
         self._seen: dict[str, Signature | None] = {}
 
     def note(self, name: str) -> None:
-        """Remember the present state of a file (its name), after the writer has changed it."""
+        """Remember the present state of the file ``name``, after the writer has changed it."""
         self._seen[name] = signature(self._folder / name)
 
     def note_all(self) -> None:
@@ -59,12 +59,12 @@ class SessionGuard:
             self.note(name)
 
     def is_in_place(self) -> bool:
-        """Return whether the folder of this name is still the opened one, by device and inode."""
+        """Return whether the path still leads to the opened folder, by device and inode."""
         found, mine = signature(self._folder), os.fstat(self._descriptor)
         return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
 
     def take_place(self) -> None:
-        """Accept the folder that has this name now as the session's.
+        """Open the folder that is at the session's path now, and compare with it from now on.
 
         It is kept open, because the inode of a removed folder may be reused.
         """

@@ -47,9 +47,10 @@ class Outcomes:
         self.poses: dict[int, tuple[str, dict[int, str]]] = {}
 
     def take(self, record: Record) -> None:
-        """Add the next record of the journal; the last one of a configuration counts.
+        """Update the outcomes by the next record of the journal.
 
-        A new plan drops all outcomes; records of registrations by hand do not count.
+        The last record of a configuration counts; a new plan drops all outcomes; registrations
+        by hand and other records change nothing.
         """
         if record['kind'] == 'plan':
             self.plan, self.poses = record['id'], {}
@@ -67,8 +68,9 @@ class Outcomes:
     def decided(self) -> Decided:
         """Return the outcomes in the form of the message to the planner.
 
-        Last pose with its decided solutions, number of solutions by outcome (references and
-        registrations not counted), and number of references.
+        Last pose (None if there is none) with its solutions that have an outcome, number of
+        solutions by outcome (references and registrations not counted), and number of outcomes
+        of references.
         """
         last = next(reversed(self.poses), None)
         solutions = () if last is None else tuple(self.poses[last][1])
@@ -195,7 +197,7 @@ class SessionJournal:
         return True
 
     def result(self, pose: int, solution: int) -> Outcome | None:
-        """Return a configuration's outcome 'recorded' or 'partial'; None if it has neither yet.
+        """Return a configuration's outcome if it is 'recorded' or 'partial'; else None.
 
         ``pose``, ``solution``: the planner's numbers.
         """
@@ -204,13 +206,17 @@ class SessionJournal:
 
     @property
     def correction(self) -> Correction | None:
-        """Correction of the rows; None for none, or before the first."""
+        """Correction by the bridge that the session's rows are measured with, as noted in it.
+
+        None if none is noted, or if the session was complete when it was opened.
+        """
         return None if self._writer is None else self._writer.correction
 
     def take_correction(self, correction: Correction) -> None:
-        """Store, before the first row, that a correction is on.
+        """Note in the session, before its first row, that the bridge corrects the commands.
 
-        Raises InputError if rows were written without one, DiskError if the disk is full.
+        Nothing changes if one is noted already. Raises InputError if rows were written without
+        one, DiskError if the disk is full.
         """
         assert self._writer is not None
         self._writer.correct(correction)
@@ -319,7 +325,7 @@ class SessionJournal:
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
         """Return a reading's fields for an observation, without the number of dropped frames.
 
-        The stamp is shifted; of a sensor on the tool the pose is inverted.
+        The stamp is shifted (`_keep_time`); of a sensor on the tool the pose is inverted.
         """
         if reading.sensor in self._header.on_tool:
             reading = reading.inverted()
@@ -329,7 +335,8 @@ class SessionJournal:
     def _keep_time(self, stamp_s: float) -> None:
         """Set and record a shift of stamps if the clock ran backwards: session time never does.
 
-        ``stamp_s``: the first of the next rows, which then is 1 s (`SHIFT_S`) after the last one.
+        ``stamp_s``: stamp of the first of the next rows. With the shift it is 1 s (`SHIFT_S`)
+        after the last row. Nothing happens if the clock did not run backwards.
         """
         assert self._writer is not None
         last_s = self._writer.last_stamp_s

@@ -77,9 +77,10 @@ def _begin(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _remove_beginnings(folder: Path, empty_rows: bytes) -> None:
-    """Remove the files of a writer that was killed before the folder was a session.
+    """Remove the files of a writer that was killed before it wrote session.yaml.
 
-    A folder with a session, or with other files, is unchanged.
+    A folder with a session, or with other files than such a writer's and a plan, is unchanged.
+    ``empty_rows``: content of observations.csv without rows.
     """
     names = {path.name for path in folder.iterdir() if path.suffix != '.tmp'} - {PLAN}
     if HEADER in names or names - {URDF, ROWS}:
@@ -121,9 +122,10 @@ def _refuse_another(folder: Path, files: Mapping[str, bytes], even_complete: boo
 
 
 def _reopen(folder: Path, *, keep_status: bool) -> str:
-    """Remove temporary files and checksums of a closed session; return its session.yaml as text.
+    """Prepare a session folder for more rows; return its session.yaml as text.
 
-    Its exit status becomes ``aborted``, unless ``keep_status``.
+    Temporary files and the checksums are removed, and the exit status becomes ``aborted``,
+    unless ``keep_status``.
     """
     path = folder / HEADER
     remove_leftovers(folder)
@@ -243,9 +245,11 @@ class SessionWriter:
         self._empty_rows = self._format.header.encode()
 
     def _complete_correction(self, plain_rows: bytes) -> None:
-        """Complete columns and key of a recorded correction after a crash; nothing without one.
+        """Complete a correction that the journal has and the other files may lack after a crash.
 
-        ``plain_rows``: observations.csv without rows and without its columns.
+        Its columns go into an observations.csv without rows, its key into session.yaml.
+        Nothing happens without a recorded one. ``plain_rows``: observations.csv without rows
+        and without these columns.
         """
         noted = [record for record in self.records if record['kind'] == 'correction']
         if not noted:
@@ -257,15 +261,19 @@ class SessionWriter:
             write_atomically(self.folder / HEADER, self._text)
 
     def _use_correction(self, correction: Correction) -> None:
-        """Add columns and key of a correction in memory; the files are written by `_write_due`."""
+        """Add the columns and the key of a correction to the contents in memory.
+
+        The files are written by `_write_due`.
+        """
         self.correction = correction
         self._add_columns('wanted', 'correction')
         self._text = with_correction(self._text, correction)
 
     def correct(self, correction: Correction) -> None:
-        """Record the correction that is on, before the first row: desired angles get columns.
+        """Record, before the first row, that the bridge corrects commands; add columns for it.
 
-        A second call only completes the first. Raises InputError if there are rows already or the
+        The columns have the desired joint angles, and whether the correction was on. A second
+        call only completes the first. Raises InputError if there are rows already or the
         writer is closed; DiskError if the disk is full: call again when there is room.
         """
         if self.correction is None:
@@ -280,9 +288,10 @@ class SessionWriter:
         self._write_due()
 
     def _write_due(self) -> None:
-        """Write the files whose columns or keys have changed; DiskError if the disk is full.
+        """Write the files whose columns or keys a correction has changed.
 
-        Those that are not written remain due.
+        Raises DiskError if the disk is full; files not written then are written by the next
+        call.
         """
         while self._due:
             name = self._due[0]
@@ -415,7 +424,11 @@ class SessionWriter:
         return renamed
 
     def _note_restored(self, name: str, change: str, renamed: str) -> None:
-        """Add a repair to `restored`."""
+        """Add a line on a repaired file to `restored`.
+
+        ``name``: of the file; ``change``: what happened to it; ``renamed``: new name of the
+        foreign file, '' if there was none.
+        """
         kept = f'; what was found there is {renamed}' if renamed else ''
         self.restored.append(
             f'{self.folder / name}: {change} while the session was written; it was restored with '
@@ -434,7 +447,10 @@ class SessionWriter:
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _accept(self, keys: Sequence[RowKeys]) -> None:
-        """Update next free numbers, last stamp and rules by rows on the disk, in their order."""
+        """Update next free numbers, last stamp and rules by rows that are on the disk.
+
+        ``keys``: of these rows, in their order.
+        """
         for key in keys:
             self._rules.accept(key)
             self._line = key.line + 1

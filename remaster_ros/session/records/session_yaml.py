@@ -42,12 +42,16 @@ log = logging.getLogger('remaster_ros')
 
 
 class _Robot(msgspec.Struct):
+    """Key ``robot`` of session.yaml: URDF file, base link and tip link."""
+
     urdf: str
     base_link: str
     tip_link: str
 
 
 class _Sensor(msgspec.Struct):
+    """A sensor in session.yaml: markers, kind, whether it is on the tool or measures poses."""
+
     marker: str
     further_markers: tuple[str, ...] = ()
     orientation: bool = False
@@ -56,7 +60,7 @@ class _Sensor(msgspec.Struct):
 
 
 class BaseFrame(msgspec.Struct):
-    """A registration known in advance, as written in files; see `BasePrior`."""
+    """Prior of a sensor's registration (its frame in the robot base), as written in files."""
 
     translation_m: Triple
     rotation_xyzw: tuple[float, float, float, float]
@@ -64,7 +68,7 @@ class BaseFrame(msgspec.Struct):
     std_rad: float
 
     def problem(self, key: str) -> str:
-        """Return what is wrong with the quaternion (norm off 1 by over 0.001); '' if valid.
+        """Return the error of a quaternion whose norm is off 1 by over 0.001; '' if it is valid.
 
         ``key``: path of this prior in the file, at the beginning of the message.
         """
@@ -115,7 +119,10 @@ class SessionHeader(msgspec.Struct):
     def session(
         self, urdf: str, measurements: Measurements, references: Measurements | None = None
     ) -> Session:
-        """Return the session with this header, a URDF text, rows, and rows of references."""
+        """Return a session of this header and the given rows.
+
+        ``urdf``: text; ``references``: rows of the reference configurations, None for none.
+        """
         return Session(
             urdf=urdf,
             base_link=self.robot.base_link,
@@ -318,7 +325,10 @@ def _problem(header: SessionHeader) -> str:
 
 
 def _controller_problem(controller: Controller) -> str:
-    """First error in the pad's joints: names, zeros, couplings; '' if valid."""
+    """First error in the joints as the teach pendant counts them; '' if valid.
+
+    Checked are their names, zeros and couplings.
+    """
     if not controller.joints:
         return 'controller.joints: none given; name the joints of the URDF, or leave it out'
     names = [joint.name for joint in controller.joints.values()]
@@ -343,7 +353,10 @@ def _controller_problem(controller: Controller) -> str:
 
 
 def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path: Path) -> None:
-    """Raise InputError if the pad has joints that the URDF lacks; `path`: of session.yaml."""
+    """Raise InputError if the key ``controller`` has a joint that the URDF lacks.
+
+    `joint_names`: of the URDF; `path`: of session.yaml, for the message.
+    """
     for name in header.controller.joints if header.controller is not None else ():
         if name not in joint_names:
             raise InputError(
@@ -355,9 +368,10 @@ def require_known_joints(header: SessionHeader, joint_names: Sequence[str], path
 def _unknown_keys(
     content: Mapping[str, Any], known: Mapping[str, Any], path: Path, prefix: str = ''
 ) -> dict[str, Any]:
-    """Return the keys of nested dictionaries that ``known`` lacks, with a warning for each.
+    """Return the part of nested dictionaries whose keys ``known`` lacks, with a warning for each.
 
-    ``prefix``: dotted path of the present dictionary, for the warning.
+    ``known``: dictionaries with all known keys; ``prefix``: dotted path of ``content`` in the
+    file, for the warning.
     """
     extra = {}
     for key, value in content.items():

@@ -114,7 +114,7 @@ def together(sessions: Sequence[tuple[str, Session]]) -> tuple[Session, list[str
 
 
 def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], list[str]]:
-    """Ask whether sessions were measured with one arm, by the zero-offsets of each alone.
+    """Compare sessions' zero-offsets, each fitted alone, to see whether they are of one arm.
 
     Parameters
     ----------
@@ -124,7 +124,8 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
     Returns
     -------
     list of str, list of str
-        What a few offsets differ in, and which sessions cannot answer alone, a sentence each.
+        A sentence on each later session of which a few offsets differ, and one on each session
+        or pair that cannot be compared.
 
     Raises
     ------
@@ -167,14 +168,15 @@ def disagreements(sessions: Sequence[tuple[str, Session]]) -> tuple[list[str], l
 
 
 def _words(differences: OffsetDifferences) -> str:
-    """Return the joints whose zero-offsets differ between two sessions, as a clause."""
+    """Return a clause on the joints whose zero-offsets differ between two sessions."""
     return f'fitted one by one their zero-offsets differ, {differences.words}'
 
 
 def _require_same_arm(first_name: str, first: Session, name: str, session: Session) -> None:
-    """Raise InputError if sessions have different robots, or corrections in the controller.
+    """Raise InputError if two sessions have different robots or controller corrections.
 
-    Different: URDF, base or tip link, or serial number, if both sessions have one.
+    Different robots: URDF, base or tip link, or serial number, if both sessions have one.
+    Corrections: those made inside the controller; none is different from one.
     """
     inside = [
         str(given.correction)
@@ -202,9 +204,10 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
 
 
 def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
-    """Return new, unused names of sensors and markers, by their old ones.
+    """Return a new, unused name for each sensor and marker of a session, by the old name.
 
-    NAME_2 for session number 2, again with _2 while that is taken in the joined session.
+    ``number``: of the session. NAME_2 for number 2; ``_2`` is added until the name is unused
+    in the joined session.
     """
     taken = {*joined.sensors, *joined.markers}
     names = {}
@@ -218,9 +221,9 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
 
 
 def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> Measurements:
-    """Return rows with a number added to each column of ``added``, and ``frames`` to frames.
+    """Return rows with a number added to each column: ``added``, column name -> number.
 
-    Rows without a frame (-1) stay without one.
+    ``frames`` is added to frame numbers; rows without a frame (-1) stay without one.
     """
     columns = {name: getattr(part, name) + more for name, more in added.items()}
     if part.frame is not None:
