@@ -85,11 +85,11 @@ def session_from(
     ----------
     joints
         Reported joint angles, (n, k), base to tip; or a dict of arrays with one for each joint of
-        the URDF; or a data frame, whose columns are found as those of a table are.
+        the URDF; or a data frame, whose columns are recognised as those of a table file.
     points
         Measured marker positions in the sensor's own frame, (n, 3); or a dict of x, y and z; or a
-        data frame. Rows of two frames are joined by their index; by their names, times or order
-        if both merely count the rows.
+        data frame. Rows of two frames are joined by their index; if both indices merely count the
+        rows, by columns with names or times, or by order.
     urdf
         File of the nominal arm.
     base_link, tip_link
@@ -180,7 +180,7 @@ def import_table(
     urdf, base_link, tip_link, never_mastered, sensor_kind, seed
         As of `session_from`.
     joints, points, time, names, join
-        Names of columns, and how two tables are joined, if that is not to be found by itself.
+        Names of columns, and how two tables are joined; () or '' to recognise them in the tables.
     angles, length
         Units, if they are neither in the header nor guessed right.
     sheets

@@ -35,8 +35,8 @@ class Fit(FitResult):
     def joint_offsets_std_shown(self) -> FloatArray:
         """Standard deviations of the offsets if link lengths may differ from the drawing, (k,).
 
-        rad or m, as reports show them. ``joint_offsets_std`` is that of an arm that is exactly
-        its drawing.
+        rad or m, as reports show them. ``joint_offsets_std``, in contrast, assumes that all link
+        lengths and joint axes are exactly those of the URDF.
         """
         from remaster_ros.reports.loadable import uncertainty
 

@@ -29,15 +29,16 @@ def parameter(
     Parameters
     ----------
     default
-        Its value if the user gives none; its type is the parameter's type.
+        Value if the user gives none; its type is the parameter's type.
     description, unit
         For the user; shown by ``ros2 param describe``.
     low, high
-        Smallest and largest allowed value, both included.
+        Smallest and largest allowed value, both included; None for no limit.
     off
-        The value outside of them by which it is switched off; None if there is none.
+        Further allowed value, outside of this range, that switches off what the parameter limits;
+        None if there is none.
     choices
-        The allowed words of a text parameter.
+        Allowed words of a text parameter; () if any text is allowed.
     live
         Whether it can be changed while the node runs, if the node has an `on_change`.
     """

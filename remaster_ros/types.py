@@ -149,8 +149,9 @@ class Priors:
     base
         Sensor name -> registration.
     geometry_tolerance_m
-        Of the drawing: RMS displacement of the marker by each link length and each axis tilt off
-        it, at least, m. Links are machined and assembled to a tenth of a millimetre or so.
+        Least error of the nominal geometry, m: RMS displacement of the marker by the error of each
+        link length, and by that of each axis tilt. Links are machined and assembled to a tenth of
+        a millimetre or so.
     """
 
     joint_offsets: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -261,7 +262,7 @@ class Measurements:
 class PadJoint:
     """Name, unit, sign and zero with which a robot's own pad (teach pendant) shows one joint.
 
-    The URDF's angle is ``sign`` times the pad's, with those coupled to it added, +
+    The URDF's angle is ``sign`` times the sum of the pad's angle and those coupled to it, plus
     ``zero_deg``.
 
     Attributes
@@ -275,7 +276,8 @@ class PadJoint:
     zero_deg
         The URDF's angle where the pad shows 0, degrees.
     coupling
-        Joint of the URDF -> 1 or -1: what of the pad's angle of that joint is added to this one's.
+        Joint of the URDF -> 1 or -1: sign with which the pad's angle of that joint is added to
+        this one's.
     """
 
     name: str
@@ -368,8 +370,8 @@ class Session:
         Sensor name -> ``camera``, ``tracker``, or ``controller`` where the robot itself computed
         the points; without an entry where it is unknown.
     on_tool
-        Those of them that are on the tool, and what they measure beside the robot: their readings
-        are those of the sensor itself, in the frame of what it measures.
+        Those of the sensors that are on the tool, and measure a target beside the robot: their
+        readings are positions of the sensor itself, in the frame of that target.
     measurements
         What is fitted and what is held out: no row of them is a reference.
     references
@@ -566,14 +568,14 @@ class Session:
     def through_correction(self) -> Session:
         """Return the rows with the correction on, as of the nominal robot at the angles wanted.
 
-        A new session whose ``q`` is what was ``wanted``; previous angles are unknown, and it
+        A new session whose ``q`` are the angles ``wanted``; previous angles are unknown, and it
         has no references and states no correction. What a fit finds in it is the error that
         the correction leaves; it must not be loaded as a correction.
 
         Raises
         ------
         ValueError
-            No row has a correction on, or one of these does not tell what was wanted.
+            No row has a correction on, or one of these rows has no ``wanted``.
         """
         on = self.is_corrected
         found = replace(self.select(on), correction=None, references=None)

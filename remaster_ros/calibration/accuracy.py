@@ -101,10 +101,11 @@ def accuracy_of(
     rng: np.random.Generator,
     modelled: ToolOrientations | None = None,
 ) -> dict[str, Any]:
-    """The metrics before and after, as fit.json has them.
+    """Metrics of accuracy with the offsets at zero and as estimated, as fit.json has them.
 
     By split ('optimization', 'validation'), None for one without rows: relative, position,
-    theoretical and the paper's theoretical error, the latter two also over the whole workspace. A
+    theoretical and the paper's theoretical error, the latter two also over the whole
+    workspace. Each has the keys 'before' (offsets at zero) and 'after' (as estimated). A
     metric that is not available has None for its numbers and the reason as ``why``.
 
     Parameters
@@ -157,10 +158,12 @@ def _measured(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """The metrics of eq. 17 and 18 before and after, of the chosen rows: dict for fit.json.
+    """Metrics of eq. 17 and 18 with the offsets at zero and as estimated: dict for fit.json.
 
-    'relative' is over ``pairs`` (m, 2), and has the reason ``why`` in place of numbers without
-    pairs; 'post_registration' is over ``chosen`` (c,). Both arrays are indices of measurements.
+    Keys: 'relative', over ``pairs`` (m, 2), and 'post_registration', over ``chosen`` (c,);
+    both arrays are indices of measurements. Each has 'before' (from ``predicted_before``,
+    modelled markers with offsets at zero, m, (n, 3)) and 'after'. Without pairs 'relative' has
+    None for both, and the reason as ``why``.
     """
     predicted = {'before': predicted_before, 'after': predicted_after}
     if len(pairs) > 0:
@@ -183,11 +186,11 @@ def _measured(
 
 
 def _theoretical(both: Sequence[Distances], suffix: str = '') -> dict[str, Any]:
-    """Theoretical metrics as fit.json has them: summaries of the distances of both versions.
+    """Theoretical metrics as fit.json has them: `summary` of each field of two `Distances`.
 
-    ``both``: distances of the invariant version and of the paper's. Keys are 'theoretical' and
-    'paper_theoretical', each with the suffix; values are `summary` of each field of
-    `Distances`.
+    ``both``: distances of the invariant version, then of the paper's
+    (`theoretical_distances`); their keys are 'theoretical' and 'paper_theoretical', each with
+    the suffix.
     """
     return {
         name + suffix: {side: summary(values) for side, values in distances._asdict().items()}

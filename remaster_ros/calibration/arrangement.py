@@ -143,7 +143,10 @@ class Arrangement:
         return scale * columns[:, list(self.order)] * np.array(self.signs)
 
     def points(self, points: FloatArray) -> FloatArray:
-        """Points, m, (n, 3), of a table's: X and Y exchanged if mirrored, then scaled."""
+        """Points for the robot, m, from the points of a table, (n, 3), as a copy.
+
+        X and Y are exchanged if ``mirrored``, then all are multiplied by ``length_scale``.
+        """
         return (points[:, [1, 0, 2]] if self.mirrored else points) * self.length_scale
 
 
@@ -174,15 +177,19 @@ class Fitted:
 
     @property
     def worst_error_m(self) -> float:
-        """Error of the fit, m: the larger of its median and its scaled 90 % quantile."""
+        """Error of the fit, m: the larger of the median and the 90 % quantile of the distances.
+
+        The quantile is scaled so that it equals the median if the errors are Gaussian.
+        """
         return max(self.error_m, self.most_error_m)
 
 
 def arranged(session: Session, arrangement: Arrangement) -> Session:
     """Copy of a session with joints, points, labels, marker positions and tool rearranged.
 
-    Shift and exchanged labels concern only the rows from ``since`` to before ``until``. Rows that
-    a shift leaves without joints are dropped. The checksum of the observations is ''.
+    The arrangement's shift and exchanged labels apply only to observations from its ``since``
+    (inclusive) to its ``until`` (exclusive). Rows that a shift leaves without joints are
+    dropped. The checksum of the observations is ''.
     """
     m = session.measurements
     moved = replace(
@@ -261,8 +268,9 @@ def joint_rows_of_points(
 ) -> tuple[IntArray, BoolArray]:
     """Row whose joints belong to each point, (n,), and mask of the points that have one, (n,).
 
-    Points of rows that are not ``concerned`` keep their own joints. The other rows of each sensor
-    and marker take the joints ``shift`` rows before; the first (last, if negative) have none.
+    Points of rows that are not ``concerned`` (mask) keep their own joints. The other points
+    take the joints ``shift`` rows before, among such rows of the same sensor and marker. The
+    first ``shift`` of these have none (the last, if negative): their row has no meaning.
     """
     joint_rows, kept = np.arange(len(m)), np.ones(len(m), bool)
     for rows in streams(m):
@@ -291,10 +299,11 @@ def some_rows(session: Session) -> Session:
 
 
 def closest_fit(problem: Problem) -> tuple[Model, FloatArray, Rows]:
-    """Model, pinned parameters (size,) and sorted rows of the best of two robust starts.
+    """Model, pinned parameters (size,) and sorted rows of the better of two robust fits.
 
-    As `closest_start`: whatever its errors, the fit is not refused. Raises InsufficientDataError
-    if there are too few rows or poses to register a sensor.
+    The fits are those of `closest_start`; however large the errors are, no MisfitError is
+    raised. Raises InsufficientDataError if there are too few rows or poses to register a
+    sensor.
     """
     model = problem.empty_model()
     start, z = closest_start(
@@ -337,9 +346,9 @@ def determined_offsets(
 ) -> FloatArray:
     """Zero-offsets of a fit, rad or m, (k,); 0 for offsets that the data do not determine.
 
-    That is a standard deviation of 5 degrees (`LARGEST_OFFSET` times ``per_radian``) or more, as
-    of the joint before one that never moves. ``z``: pinned parameters, (size,); ``sigma``:
-    standard deviation of the errors per axis, m.
+    Not determined is an offset with a standard deviation of 5 degrees (`LARGEST_OFFSET` times
+    ``per_radian``) or more, such as that of the joint before one that never moves. ``z``:
+    pinned parameters, (size,); ``sigma``: standard deviation of the errors per axis, m.
     """
     derivative = model.jacobian(z, rows).reshape(3 * len(rows), -1) / sigma
     _, by_z = prior_rows(model, priors, z)
@@ -425,13 +434,13 @@ def search(session: Session, given: Fitted, lengths: Sequence[float] = ()) -> li
     """Fits of arrangements that are not gross, if the given one is wrong, the simplest first.
 
     [] with fewer than 12 rows, if the given fit is right, or if nothing fits. Units, column
-    orders, zero positions by quarter turns, a coupling of joint 3 to joint 2, and rows shifted by
-    one are tried, with any signs. If the given fit is off by over 5 mm, the error must fall to a
-    fifth (`CONVINCING`); if only offsets are whole quarter turns, any fit that is not gross
-    counts. Several can fit equally well: a mirrored symmetric arm is itself with some joints
-    reversed. ``session``: with free markers, since fixed ones at wrong positions would bend the
-    fit; ``given``: fit of the table as it is; ``lengths``: likely length scales, in metres of
-    other units over those of the given one.
+    orders, zero positions by quarter turns, a coupling of joint 3 to joint 2, and rows shifted
+    by one are tried, with any signs. If the given fit is off by over 5 mm, the error must fall
+    to a fifth (`CONVINCING`); if only offsets are whole quarter turns, any fit that is not
+    gross counts. Several can fit equally well: a mirrored symmetric arm is itself with some
+    joints reversed. ``session``: with free markers, since fixed ones at wrong positions would
+    bend the fit; ``given``: fit of the table as it is; ``lengths``: factors on the points to
+    try if their unit is wrong, such as 0.001.
     """
     if len(session.measurements) < FEWEST_ROWS:
         return []
@@ -477,11 +486,12 @@ def closest(found: Sequence[Fitted]) -> list[Fitted]:
 def within_limits(
     arrangement: Arrangement, chain: SerialChain, columns: FloatArray
 ) -> Arrangement | None:
-    """Arrangement with a whole turn added to joints with quarter turns, so that limits are kept.
+    """Arrangement with whole turns added to quarter turns, so that joints are within their limits.
 
-    A joint whose angles keep them only row by row, by up to two turns
-    (`SerialChain.within_turns`), is left as it is; None if one does not even then. ``columns``: of
-    the table, (n, k); 1 degree beyond a limit is kept.
+    A whole turn is added to or taken off a joint with quarter turns, in all rows. A joint for
+    which that does not suffice, but up to two turns chosen row by row do
+    (`SerialChain.within_turns`), is left unchanged; None if neither suffices for some joint.
+    ``columns``: the table's joints, (n, k); 1 degree beyond a limit is allowed.
     """
     q = arrangement.joints(columns)
     low, high = q.min(axis=0) + LIMIT_TOLERANCE_RAD, q.max(axis=0) - LIMIT_TOLERANCE_RAD
@@ -516,9 +526,10 @@ def _nearest(
 ) -> Iterator[Arrangement]:
     """Yield up to six arrangements of each kind (`_stages`), best in the linear problem first.
 
-    Those with errors above 15 % of the points' extent (`_LARGEST_LINEAR`) are left out; of equal
-    errors (three digits) the simplest comes first. The nearest of ``lengths`` is the length scale;
-    if G mirrors, the mirrored arrangement follows its plain one.
+    Those with errors above 15 % of the points' extent (`_LARGEST_LINEAR`) are left out; of
+    equal errors (three digits) the simplest comes first. The length scale of each is that of 1
+    and ``lengths`` which is nearest to the scale of the linear problem. If this has mirrored
+    points, the same arrangement with ``mirrored`` follows.
     """
     everywhere = np.ones(len(session.measurements), bool)
     for shift, candidates in _stages(len(chain)):
@@ -568,9 +579,10 @@ def _stages(joints: int) -> Iterator[tuple[int, list[Arrangement]]]:
 
 
 def _orders(joints: int) -> Iterable[tuple[int, ...]]:
-    """Likely column orders, sorted: tip to base, all moved along by one, any two exchanged.
+    """Likely column orders, sorted: reversed, shifted by one cyclically, any two exchanged.
 
-    Each is a permutation of 0 to joints - 1.
+    Each is a permutation of 0 to joints - 1; shifts are in both directions, and the order as
+    it is is not among them.
     """
     plain = list(range(joints))
     orders = {tuple(plain[::-1]), (*plain[1:], 0), (joints - 1, *plain[:-1])}

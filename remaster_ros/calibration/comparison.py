@@ -63,8 +63,8 @@ def compared(
 def predicted_rows(problem: Problem, model: Model, z: FloatArray) -> FloatArray:
     """Predicted marker positions of all rows in their sensors' frames N, m, (n, 3).
 
-    In file order of the problem's measurements. ``z``: pinned parameters, (size,). For a sensor on
-    the tool as in `Model.seen`.
+    In file order of the problem's measurements. For a sensor on the tool: the measured
+    position less the error of the model (`Model.seen`). ``z``: pinned parameters, (size,).
     """
     measurements = problem.measurements
     rows = model.rows(measurements, np.arange(len(measurements))).of_points

@@ -144,8 +144,9 @@ class MotionColumns:
         """Displacement in R by an elastic mode along each axis of the tool, m per s², (n, 3, 6).
 
         Columns are per unit of 1 / (2 π f)² of the mode's frequency f. The first three are
-        driven by the acceleration of the tool frame's origin, the others by that of ``middle``,
-        the middle of the markers in the tool frame, m, (3,), relative to it.
+        driven by the acceleration of the tool frame's origin; the last three by the
+        acceleration of ``middle``, the middle of the markers in the tool frame, m, (3,), less
+        that of the origin.
         """
         tool = self.links.frames[:, -1] @ self.chain.T_fixed[-1]
         frame = self.links.point_acceleration(tool[:, :3, 3])
@@ -189,9 +190,10 @@ def friction_share(
     begins anew, with the sign of the speed, and near 0 for a joint that hardly moves within a
     row.
 
-    In rows in which no joint moves it is 0; with ``turned``, the positions at which the joints
-    turned last, (n, k), it is what the way since then leaves, and 0 where that is NaN.
-    ``seconds``: times of the rows, s, (n,); ``q``, ``velocity``, ``acceleration``: (n, k).
+    In rows in which no joint moves the share is 0 if ``turned`` is None. ``turned`` are the
+    positions at which the joints reversed last, (n, k): the share at rest is then that after
+    the way from there to q, and 0 if the position is NaN. ``seconds``: times of the rows, s,
+    (n,); ``q``, ``velocity``, ``acceleration``: (n, k).
     """
     moments, first, which = np.unique(seconds, return_index=True, return_inverse=True)
     q, velocity, acceleration = q[first], velocity[first], acceleration[first]
@@ -375,9 +377,9 @@ def moving_words(found: Estimate) -> str:
 def friction_at_rest(found: Estimate) -> FloatArray:
     """Variance of each row's marker position by unknown friction of an arm at rest, m², (n,).
 
-    It is that of the error's length. The standard deviation of a joint's share of friction is
-    taken for half of the difference between the shares by the model's two travels. 0 in motion,
-    and for a fit without parameters of motion.
+    It is the sum of the variances along the three axes. The standard deviation of a joint's
+    share of friction is taken for half of the difference between the shares by the model's two
+    travels. 0 in motion, and for a fit without parameters of motion.
     """
     m, extension, model = found.problem.measurements, found.model.extension, found.model
     variance = np.zeros(len(m))

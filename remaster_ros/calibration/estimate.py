@@ -179,9 +179,10 @@ class Problem:
     def plausibility(self, model: Model, free: IntArray) -> tuple[Prior, ...]:
         """Gaussian prior on the free joint offsets that have no stated one, in a tuple.
 
-        As `plausible_offsets`: 5 degrees about 0; with the effects of a discovery in the model,
-        its ``step_std`` about the offsets of its search. () if all free offsets have a stated
-        prior. ``free``: indices of parameters; those below k are joints.
+        It is `plausible_offsets`: about 0, std 5 degrees. If the model has effects found by
+        discovery: about the offsets at which these were found, std ``step_std`` of the
+        extension. () if all free offsets have a stated prior. ``free``: indices of parameters;
+        those below k are joints.
         """
         unknown = [
             joint
@@ -340,7 +341,7 @@ def _estimated(problem: Problem, model: Model, z: FloatArray, start: Start | Non
 def of_positions_alone(found: Estimate) -> Estimate:
     """Estimate by the positions only; the same estimate if it fits no orientations.
 
-    The extension, if any, is not fitted again. Raises as `estimate`.
+    The new estimate has no extension, even if the given one has. Raises as `estimate`.
     """
     if not found.model.bodies:
         return found
@@ -427,9 +428,10 @@ def mode_at_offsets(mode: Mode, joint_offsets: FloatArray) -> Mode:
 def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
     """Gauge found again at the mode if an offset is badly determined there, else the given gauge.
 
-    Badly: a standard deviation above 0.2 degrees (`WEAK_ANGLE`) without a reason in the gauge.
-    The given gauge was found at the start, which may lie far from the mode along such a
-    direction. It is kept if the new one would hold other parameters fixed.
+    Badly determined: a standard deviation above 0.2 degrees (`WEAK_ANGLE`), of a joint for
+    which the given gauge has no reason in ``why``. The given gauge was found at the start,
+    which may lie far from the mode along such a direction. The given one is returned as well
+    if the new one would hold other parameters fixed.
     """
     posterior = mode.linearisation.posterior
     std = np.sqrt(np.diag(mode.covariance))
@@ -445,9 +447,10 @@ def _judged_at(mode: Mode, gauge: Gauge, priors: Sequence[Prior]) -> Gauge:
 
 
 def _require_information(count: int, free: IntArray, model: Model) -> None:
-    """Raise InsufficientDataError if 3 ``count`` coordinates are fewer than the unknowns.
+    """Raise InsufficientDataError if ``count`` observations have fewer numbers than unknowns.
 
-    These are the free offsets and registrations (``free``: indices), and 3 for a marker.
+    Numbers are 3 for each observation; unknowns the free offsets and registrations (``free``:
+    indices of parameters), and 3 for one marker, however many there are.
     """
     needed = int(np.sum(free < model.joints + 6 * len(model.sensor_names))) + 3
     if 3 * count < needed:
@@ -458,9 +461,10 @@ def _require_information(count: int, free: IntArray, model: Model) -> None:
 
 
 def _moved(problem: Problem, rows: Rows, errors: FloatArray) -> str:
-    """Sentence since when sensors with too many gross errors are off, with '; ' before each.
+    """Text that says from which observation on a sensor's readings are shifted, and by how much.
 
-    '' if no sensor shows a step (`moved_since`). ``errors``: measured minus modelled, m, (n, 3).
+    One clause for each sensor with a step in time (`moved_since`), each after '; ', to be
+    added to another sentence; '' without any. ``errors``: measured minus modelled, m, (n, 3).
     """
     text = ''
     for sensor, span in rows.of_points.spans:

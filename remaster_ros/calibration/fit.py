@@ -78,16 +78,16 @@ def fit_session(
         How c causes outside the model move its natural parameters, one standard deviation of
         each, (size, c): the posterior is widened by them. Not in paper mode.
     found
-        The session's estimate, where it has been made with the same priors and without further
-        effects. With these its noise along a path is taken over.
+        The session's estimate by the same priors and without an extension, if it has been made;
+        None to make it here. With an extension only its path noise is used.
 
     Raises
     ------
     InputError
         A session that does not fit its robot, or arguments out of range.
     InsufficientDataError
-        Data that do not allow an answer; where they do without a mistake in the session's tables,
-        a `MistakeFoundError` names it.
+        Data that do not determine the parameters or do not fit the robot (`MisfitError`); if a
+        mistake in the session's tables explains it, a `MistakeFoundError` names the mistake.
     """
     for what, given in (('further effects', extension), ('priors on its parameters', priors)):
         if sampler == 'paper' and given is not None:

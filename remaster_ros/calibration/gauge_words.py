@@ -133,7 +133,11 @@ def _shortened(parts: Sequence[str]) -> str:
 
 
 def in_a_line(why: str) -> str:
-    """Short form of a reason of `in_words` for a terminal: no amounts, the first of many names."""
+    """Short form of a reason of `in_words` for a terminal.
+
+    Amounts are left out, of more than 3 names the first 2 and the number of the others are
+    kept, and of the remedies at most one.
+    """
     cause, *remedies = why.split('; ')
     before, sign, after = _AMOUNT.sub('', cause).partition(' = ')
     text = after if sign else before
@@ -183,8 +187,9 @@ def resolving_priors(
 ) -> list[str]:
     """Descriptions of the priors that fix each of d directions (size, d), one text each.
 
-    Priors with at least a thousandth of the strongest pull along the direction; that of the
-    extension's parameters is `EFFECTS_PRIOR`. ``x``: natural parameters, (size,).
+    A text names all priors that have at least a thousandth of the strongest prior's pull along
+    the direction; `EFFECTS_PRIOR` stands for the prior on the extension's parameters. ``x``:
+    natural parameters, (size,).
     """
     core = replace(model, extension=None)
     names = [*(prior.description for prior in priors), EFFECTS_PRIOR]

@@ -80,8 +80,9 @@ def _above(
 ) -> float:
     """Probability that the first alarm comes at this look, less ``step``, the error rate for it.
 
-    ``limit``: of the statistic; ``grid, density``: values of statistic times share before this
-    look, and their probabilities without earlier alarms; ``place``: share of all data;
-    ``width``: standard deviation of the increase since the look before.
+    ``limit``: of the test statistic, above which it alarms; ``grid, density``: values of the
+    statistic times the share of data at the look before, and their probabilities without
+    earlier alarms; ``place``: share of all data at this look; ``width``: standard deviation of
+    the change of (statistic times share) since the look before.
     """
     return float(density @ scipy.special.ndtr((grid - limit * place) / width)) - step

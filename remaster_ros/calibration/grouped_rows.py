@@ -110,9 +110,9 @@ class Rows:
     ) -> Rows:
         """Positions as of `of`, and behind them the orientations of bodies, where they are finite.
 
-        ``bodies``: (sensor, marker) of each, indices; ``on_tool``: indices of sensors on the
-        tool, whose positions get a ``lever``. The same as `of` without bodies or measured
-        orientations.
+        ``bodies``: (sensor, marker) of each body, indices; ``on_tool``: indices of sensors on
+        the tool, for whose positions ``lever`` is set: the measured point in the sensor's own
+        frame. The same as `of` without bodies or measured orientations.
         """
         points = cls.of(measurements, rows, reference)
         if not bodies or measurements.orientation is None:
@@ -281,9 +281,10 @@ class Rows:
         )
 
     def picked(self, rows: slice | IntArray) -> Rows:
-        """Copy with the columns of some rows (slice or indices), without decorrelation.
+        """Copy with some rows (slice or indices) of each array of n rows, without decorrelation.
 
-        Groups, spans and measured orientations remain those of all rows: the caller replaces them.
+        The arrays that describe groups, spans and measured orientations are not changed, and
+        fit all rows: the caller has to replace them.
         """
         names = ('source', 'q', 'marker', 'target', 'frame', 'body', 'lever', 'place')
         columns: dict[str, Any] = {
@@ -366,7 +367,8 @@ def _members(start: IntArray, count: int) -> csr_array:
 def _sum(members: csr_array, values: FloatArray) -> FloatArray:
     """Sums of runs of values, (runs, ...), from values (n, ...).
 
-    ``members``: of `_members`, (runs, n). The values themselves, no copy, if each is a run.
+    ``members``: of `_members`, (runs, n). If each run is a single value, the values themselves
+    are returned, not a copy.
     """
     if members.shape[0] == members.shape[1]:
         return values

@@ -125,14 +125,14 @@ def find_gauge(
 def known_offsets(
     chain: SerialChain, why: tuple[str, ...], by_data: FloatArray, std: FloatArray
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Mask of the identifiable offsets, (k,), and reasons: ``why``, and one for each left out.
+    """Mask of the identifiable offsets, (k,), and the reason for each joint, k strings.
 
-    Identifiable are offsets that the data determine, or that a prior determines to at most
-    `AS_GOOD_AS_SEEN` times the median standard deviation of these (their reason stays); none
-    with a total std above a degree, and none at all if the data determine none. ``chain``: the
-    k joints; ``why``: reason for each joint that the data do not determine, '' for the others;
-    ``by_data, std``: standard deviation by the model, and with known unmodelled errors, rad or
-    m, (k,).
+    Identifiable is an offset that the data determine, or that a prior determines to at most
+    `AS_GOOD_AS_SEEN` times the median standard deviation of those that the data determine. An
+    offset with a ``std`` above a degree never is, and none is if the data determine none.
+    ``why``: reason for each joint that the data do not determine, '' for the others, which is
+    returned with a reason added for offsets that only the std rules out. ``by_data``: standard
+    deviations by the model, ``std``: with unmodelled errors added, rad or m, (k,).
     """
     by_data = by_data / chain.per_radian
     seen = np.array([not text for text in why])
@@ -255,12 +255,12 @@ def _nearly_null(
 ) -> list[tuple[FloatArray, int, float]]:
     """Directions along which an angle has a standard deviation above a limit, the worst first.
 
-    Each with the index of the angle and its std, rad or m. ``triangle``: of `_triangle`,
-    divided by ``scale``, (size,), with the effects' prior; ``pivots``: parameters taken as
-    fixed; ``angles``: mask of the parameters that count as angles, zeros of prismatic joints
-    among them, with ``per_radian`` of their units for a radian, (size,); ``limit``: rad, and at
-    least ``factor`` times the median of all angles (that at most `OPEN_ANGLE`). After each
-    direction its angle is taken as fixed, too.
+    Returns (direction, (size,); index of the angle; its std, rad or m) of each; after each one
+    its angle is taken as fixed, too. ``triangle``: of `_triangle`, divided by ``scale``,
+    (size,), with the effects' prior; ``pivots``: parameters taken as fixed; ``angles``: mask
+    of the parameters that count as angles, zeros of prismatic joints among them;
+    ``per_radian``: amount of each parameter that counts as a radian, (size,); ``limit``: rad.
+    The std must also reach ``factor`` times the median std of all angles, or `OPEN_ANGLE`.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)
@@ -318,11 +318,11 @@ def _reduce(
 ) -> tuple[FloatArray, list[int]]:
     """Basis (size, d) of a null space in reduced echelon form, and the pivot of each direction.
 
-    A pivot is the index of a parameter that is 1 in its direction and 0 in all others, the
-    largest one of the first of the ``kinds`` that the direction has. ``work``: the basis in
-    units of the ``scale``, (size,), changed in place; the result is in units of the parameters.
-    Any rotation of the basis spans the same space; in this form each direction has few
-    parameters.
+    A pivot is the index of a parameter that is 1 in its direction and 0 in all others. It is
+    taken from the first of the ``kinds`` (indices of parameters, by preference) that have a
+    part in the direction, and is the largest part of that kind. ``work``: the basis in units
+    of the ``scale``, (size,), changed in place; the result is in units of the parameters. Any
+    rotation of the basis spans the same space; in this form each direction has few parameters.
     """
     pivots: list[int] = []
     for column in range(work.shape[1]):
@@ -351,9 +351,10 @@ def _unresolved(
     """Pivots of directions that no prior resolves, all of them joints or effects, to be fixed.
 
     A pivot is unresolved if its standard deviation by the priors is above a limit: 5 degrees
-    for an angle (`UNKNOWN_ANGLE`); for an effect, of any unit, a million times the std by the
-    data if it were alone. ``by_direction``: derivative of the priors' whitened residuals along
-    each direction, (m, d). Raises InsufficientDataError if only registrations or markers are
+    (`UNKNOWN_ANGLE`) for an angle; 1000 m for another core parameter; for an effect, of any
+    unit, a million times the std that the data would give if it were the only unknown (1 /
+    ``scale``). ``by_direction``: derivative of the priors' whitened residuals along each
+    direction, (m, d). Raises InsufficientDataError if only registrations or markers are
     unresolved.
     """
     limit = np.where(_angles(model), UNKNOWN_ANGLE * _per_radian(model), 1e3)

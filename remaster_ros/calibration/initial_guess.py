@@ -88,11 +88,12 @@ def closest_start(
     marker_std_m: float,
     priors: Sequence[Prior],
 ) -> tuple[Model, FloatArray]:
-    """Solution with the smaller errors of two starts, however far the data are from the robot.
+    """Better of two robust fits, however far the data are from the robot.
 
-    Starts: markers at nominal, and markers by `_linear_markers`. Arguments and results as of
-    `robust_start`, but z has registrations off the reference. Raises InsufficientDataError if a
-    sensor's points do not fix a registration; never MisfitError.
+    One fit begins with the markers at nominal, one with those of `_linear_markers`. Arguments
+    as of `robust_start`. Returns the model with reference registrations, and pinned parameters
+    (size,), whose registrations may differ from the reference. Raises InsufficientDataError if
+    a sensor's points do not fix a registration; never MisfitError.
     """
     chain = model.chain
     tool = chain.forward(measurements.q[rows])
@@ -122,11 +123,13 @@ def closest_start(
 def with_bodies(
     model: Model, z: FloatArray, measurements: Measurements, rows: IntArray
 ) -> tuple[Model, FloatArray, str]:
-    """Model that fits measured orientations, and z with the rotations of the bodies.
+    """Model that fits measured orientations of bodies, with its pinned parameters and a reason.
 
-    ``model, z``: near the mode by the positions; ``measurements, rows``: the observations, and the
-    rows to fit. Last result: the reason, a sentence, if orientations were measured and cannot be
-    fitted (model and z are then unchanged), else ''.
+    A body is a pair of sensor and marker with enough measured orientations; ``z`` is extended
+    by its rotation, at 0. ``model, z``: near the mode by the positions; ``measurements,
+    rows``: the observations, and the rows to fit. The reason is a sentence if orientations
+    were measured and cannot be fitted, else ''; without bodies model and z are unchanged, as
+    for a model with an extension.
     """
     if measurements.orientation is None or model.extension is not None:
         return model, z, ''
@@ -215,8 +218,9 @@ def referenced(
 def _require_right_hand(model: Model, rows: Rows, predicted: FloatArray) -> None:
     """Raise MisfitError if a sensor's points agree with the robot only when mirrored.
 
-    That is if they are off by over 3 % of their extent, and mirrored by under 30 % of that.
-    ``predicted``: in the coordinates of `Rows.target`, m, (n, 3).
+    That is if the RMS error after the best rotation is over 3 % of the points' extent, and
+    that of the mirrored points under 30 % of that error. ``predicted``: modelled positions, in
+    the coordinates of `Rows.target`, m, (n, 3).
     """
     for sensor, span in rows.spans:
         measured, modelled = rows.target[span], predicted[span]

@@ -92,9 +92,10 @@ class Mode:
 
     @property
     def weakest(self) -> str:
-        """Names of the parameters that are determined worst together, without effects, as text.
+        """Names of the parameters that are determined worst together, as text.
 
-        A curve of a joint always has a coefficient that only its smoothness prior determines.
+        Without those of the extension: of an error curve of a joint, an effect, a coefficient
+        is always determined by its smoothness prior alone.
         """
         posterior = self.linearisation.posterior
         core = posterior.free < posterior.model.core
@@ -304,8 +305,9 @@ def _noise_peak(linearisation: Linearisation, start: FloatArray, shortest: float
 def _noise_covariance(linearisation: Linearisation, peak: FloatArray) -> FloatArray:
     """Covariance of the noise's coordinates, (e, e), by the curvature at their peak, (e,).
 
-    A common part (of pose or frame) whose coordinate is within two standard deviations of zero
-    has the mean square of its deviations by quadrature instead, and no correlations.
+    If the coordinate of a common part (of pose or frame) is within two standard deviations of
+    zero, its variance is its mean squared deviation from the peak, integrated numerically, and
+    its covariances are 0.
     """
     precision = _noise_curvature(linearisation, peak)
     count = len(linearisation.posterior.noise_model.channels)

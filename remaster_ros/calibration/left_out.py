@@ -77,10 +77,10 @@ class Contrasts:
         return gram
 
     def distances(self, kind: int, covariance: FloatArray) -> Iterator[float]:
-        """Yield the squared error per number of each pose of one kind, as of poses not fitted.
+        """Yield the squared Mahalanobis distance of each pose of one kind, per error of the pose.
 
-        It is e' (I + X Σ X')⁻¹ e over the number of errors e (squared Mahalanobis distance),
-        with their derivative X. ``kind``: twice the sensor's index, and one more for means of
+        For a pose that was not fitted: e' (I + X Σ X')⁻¹ e / (number of e), with its errors e
+        and their derivative X. ``kind``: twice the sensor's index, and one more for means of
         poses; ``covariance``: Σ of the parameters in units of the noise, (f, f).
         """
         for pose in np.unique(self.pose[self.kind == kind]):
@@ -157,11 +157,12 @@ def _share_of_orders(n: int, m: int, larger: int) -> float:
 
 
 def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, FloatArray]:
-    """Squared Mahalanobis distance per number of each fitted pose, left out in turn, by kind.
+    """Squared Mahalanobis distance of each fitted pose by the fit without that pose, by kind.
 
-    Kind of contrasts -> (poses with the kind,). In units of the noise without the pose. At most
-    1,000 poses, evenly spread; poses that alone determine a direction are skipped.
-    ``covariance``: of the parameters, (f, f).
+    Dict: kind of contrasts -> (poses with the kind,). The distance is divided by the number of
+    the pose's errors of the kind. The noise is estimated without the pose, too. At most 1,000
+    poses, evenly spread; poses that alone determine a direction are skipped. ``covariance``:
+    of the parameters, (f, f).
     """
     kinds = np.unique(fitted.kind).tolist()
     f = len(covariance)
@@ -197,12 +198,11 @@ def left_out_distances(fitted: Contrasts, covariance: FloatArray) -> dict[int, F
 
 
 def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
-    """Variance of the noise: sum of squared errors over the degrees of freedom, at least 1.
+    """Variance of the noise: sum of squared errors over the degrees of freedom (at least 1).
 
-    The errors are those at the fit, as they are. The degrees of freedom are ``size``, the
-    number of errors, less the trace of the columns' Gram matrix times ``covariance``. ``gram``:
-    Gram matrix of [columns | errors], (f + 1, f + 1); ``covariance``: of the fitted parameters
-    in units of the noise, (f, f).
+    The degrees of freedom are ``size``, the number of errors, less the trace of the columns'
+    Gram matrix times ``covariance``. ``gram``: Gram matrix of [columns | errors at the fit],
+    (f + 1, f + 1); ``covariance``: of the fitted parameters in units of the noise, (f, f).
     """
     freedom = size - np.sum(gram[:-1, :-1] * covariance)
     return float(gram[-1, -1] / max(freedom, 1.0))

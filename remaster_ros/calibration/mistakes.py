@@ -73,11 +73,12 @@ class Mistakes:
 
 
 def find_mistakes(session: Session) -> Mistakes:
-    """Mistakes without which a session fits its robot, each tried and fitted.
+    """Robust fit of a session as it is, and the fits with a mistake corrected that fit the robot.
 
-    Nothing is tried, so that ``fitting`` is (), with fewer than 12 rows (`FEWEST_ROWS`) or a joint
-    that slides. ``session``: does not fit its robot, or fits with gross offsets or errors. Raises
-    InsufficientDataError if there are too few rows for a fit.
+    Each likely mistake is corrected by trial and fitted. None is tried (``fitting`` is ())
+    with fewer than 12 rows (`FEWEST_ROWS`) or a joint that slides. ``session``: does not fit
+    its robot, or fits with gross offsets or errors. Raises InsufficientDataError if there are
+    too few rows for a fit.
     """
     joints = session.measurements.q.shape[1]
     # A marker that is firm at a wrong place would bend the fit.
@@ -131,12 +132,13 @@ def sound_estimate(
     priors: Priors | None = None,
     fitted: Callable[[Problem], Estimate] = estimate,
 ) -> Estimate:
-    """Estimate of a session that fits its robot; ``fitted``: function that estimates it.
+    """Estimate of a session that fits its robot; else an error, with the mistake if one is found.
 
-    A gross estimate (`is_gross`) is returned all the same if no mistake explains it. Raises
-    MistakeFoundError, which names the mistake, if the session does not fit or is gross, and fits
-    without it; MisfitError if it does not fit and none of the tried mistakes explains it; and
-    InsufficientDataError and InputError as ``fitted``.
+    A gross estimate (`is_gross`) is returned all the same if no mistake explains it.
+    ``fitted``: function that estimates. Raises MistakeFoundError if the session does not fit
+    the robot, or is gross, and fits with a mistake corrected; MisfitError if it does not fit
+    and none of the tried mistakes explains it; and InsufficientDataError and InputError as
+    ``fitted``.
     """
     try:
         found = fitted(Problem.of(session, priors))
@@ -181,8 +183,9 @@ def _mistake_found(session: Session, mistakes: Mistakes, what: str) -> MistakeFo
 def _tool_mistakes(session: Session, given: Fitted) -> list[Fitted]:
     """Fits of tip links, tool turns and exchanged labels with markers at their stated positions.
 
-    Stated to within 5.5 stated standard deviations, but at least 5 mm. [] if the markers of
-    ``given`` are there already, or if nothing tried brings them there.
+    A marker is at its stated position if the fit is within 5.5 of its stated standard
+    deviations, or within 5 mm, of it. [] if all markers of ``given`` are already, or if
+    nothing tried brings them there.
     """
     allowed = max(DISPLACED * session.marker_std_m, MARKER_SHIFT_M)
     if given.marker_shift_m < allowed:
@@ -218,11 +221,11 @@ def _pairs(m: Measurements) -> list[tuple[int, int]]:
 
 
 def _mistakes_from_row(session: Session) -> Iterator[Arrangement]:
-    """Yield arrangements with a mistake from a row on, or up to one, at the row that fits best.
+    """Yield arrangements with a mistake from a row on, or up to a row, at the row that fits best.
 
-    Labels of two markers exchanged from or until a row, and points shifted by one row from a
-    row on. One half of the rows has no such change: the first half as given, and the last half
-    with the change, are fitted; every row is compared with both fits.
+    Mistakes are labels of two markers exchanged from or until a row, and points shifted by one
+    row from a row on. The first half of the rows is fitted as if before the change, and the
+    last half as if after it; each fit gives one row at most (`_divisions`).
     """
     m = session.measurements
     plain, everywhere = Arrangement.given(m.q.shape[1]), np.ones(len(m), bool)
@@ -242,9 +245,9 @@ def _mistakes_from_row(session: Session) -> Iterator[Arrangement]:
 def _divisions(session: Session, before: Measurements, after: Measurements) -> Iterator[int]:
     """Yield rows (index from 0) at which a change from the first table to the second fits best.
 
-    At most two: by the fit of the first half of ``before``, and of the last half of ``after``.
-    None with fewer than 12 rows (`FEWEST_ROWS`) in a half, or if the best is the first or the last
-    end.
+    At most two rows: by the fit of the first half of ``before``, and by that of the last half
+    of ``after``; the same row may come twice. None with fewer than 12 rows (`FEWEST_ROWS`) in
+    a half, from a fit that fails, or if one table alone fits best.
     """
     half = len(before) // 2
     if half < FEWEST_ROWS:
@@ -309,9 +312,10 @@ class Columns:
 def sentence_of_mistakes(
     mistakes: Mistakes, session: Session, columns: Columns
 ) -> tuple[str, str]:
-    """Sentence with the mistakes, and the options that correct the first of them.
+    """Sentence with the mistakes, and the options of ``remaster import`` that correct the first.
 
-    Others that fit as well follow with their options, if they take at most one change more.
+    The sentence also names other arrangements that fit as well, with their options, if these
+    have at most one change more than the first. ``mistakes``: with at least one fit.
     """
     found, given = mistakes.fitting[0], mistakes.given
     words, options = in_words(found.arrangement, session, columns)

@@ -161,9 +161,10 @@ class Model:
         return slice(start, start + 3)
 
     def vector(self, joint_offsets: FloatArray, markers: FloatArray) -> FloatArray:
-        """Parameter vector of offsets (k,) and markers (markers, 3).
+        """Parameter vector (size,) of joint offsets (k,) and markers (markers, 3).
 
-        Registrations are at the references, theta is at theta0.
+        Registrations and orientations of bodies are at their references (corrections 0), theta
+        is at theta0.
         """
         corrections = np.zeros(6 * len(self.sensor_names))
         theta0 = self.extension.theta0 if self.extension is not None else np.zeros(0)
@@ -177,7 +178,7 @@ class Model:
     def markers(self, x: FloatArray) -> FloatArray:
         """Marker positions in the tool frame T, m, (..., markers, 3), a view of x (..., size).
 
-        Pinned parameters have pinned positions: see the module.
+        For pinned parameters these are the pinned positions: moved with joint k (`pinned`).
         """
         start = self.joints + 6 * len(self.sensor_names)
         part = x[..., start : self.markers_end]
@@ -314,10 +315,10 @@ class Model:
     def seen(self, z: FloatArray, rows: Rows) -> FloatArray:
         """Predicted positions as the sensors see them, in R by the references, m, (..., n, 3).
 
-        For a sensor on the tool: the measured position less the error, ``rows.target`` less
-        `predict`. The sensor's own position by its readings has the noise of the orientation
-        multiplied by the distance, which is no error of the arm. ``z``: pinned parameters,
-        (..., size); ``rows``: n rows, of positions only.
+        For a sensor on the tool: the measured position less the error (``rows.target`` less
+        `predict`), so that measured less this is the error of the arm. A predicted position of
+        the sensor itself would have the noise of its orientation times the distance. ``z``:
+        pinned parameters, (..., size); ``rows``: n rows, of positions only.
         """
         predicted = self.predict(z, rows)
         return predicted if rows.lever is None else predicted + (rows.measured - rows.target)

@@ -64,7 +64,7 @@ def motion_proof(
     speeds
         Speeds of the markers, m/s, (n,); 0 at standstill.
     friction
-        Variance of the markers by what is not known of the friction at rest, m² of the length,
+        Variance of the marker's position (sum over three axes) by unknown friction at rest, m²,
         (n,).
 
     Notes

@@ -153,7 +153,9 @@ class NoiseModel:
     def size_of(self) -> FloatArray:
         """Factor of pose_sigma² in the variance of each error group, (error groups,).
 
-        The number of rows of a pose for groups of kind 'poses', else 0.
+        For a group of poses' means: the frames of a pose times the harmonic mean of their
+        rows, which is the number of its rows if frames are of one size. 0 for all other
+        groups.
         """
         return np.array([group.size for group in self.error_groups])
 
@@ -161,7 +163,8 @@ class NoiseModel:
     def frame_size_of(self) -> FloatArray:
         """Factor of frame_sigma² in the variance of each error group, (error groups,).
 
-        The mean number of rows of a frame; 0 for groups of kind 'rows'.
+        For groups of means of frames or poses: the harmonic mean of the numbers of rows of a
+        pose's frames. 0 for groups of rows' deviations from the means of their frames.
         """
         return np.array([group.frame_size for group in self.error_groups])
 
@@ -181,7 +184,10 @@ class NoiseModel:
 
     @property
     def shares(self) -> list[int]:
-        """Channels (indices) of the common parts: those `separable`, then those `framed`."""
+        """Channels (indices) with a pose_sigma, then those with a frame_sigma.
+
+        These are `separable` and `framed`. A channel with both is in the list twice.
+        """
         return [*self.separable, *self.framed]
 
     def noise(self, sigma: FloatArray, shared: FloatArray) -> Noise:
@@ -257,7 +263,8 @@ class NoiseModel:
     def gram(self, features: Callable[[Rows, slice], FloatArray], width: int) -> FloatArray:
         """Gram matrix of features in each error group, (error groups, width, width).
 
-        ``features``: as of `parts`; ``width``: number of features.
+        ``features``: function from rows, and their slice among all rows, to vectors (rows, 3,
+        width), as of `parts`; ``width``: number of features.
         """
         result = np.zeros((len(self.error_groups), width, width))
         for index, part in self.parts(features):
@@ -269,13 +276,13 @@ class NoiseModel:
     def parts(
         self, features: Callable[[Rows, slice], FloatArray]
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (error group, columns (r, width)) whose products sum up to those of the features.
+        """Yield (index of error group, columns (r, width)), whose C' C sum up to the Gram matrix.
 
-        The columns are decorrelated and turned into the noise's frames, not weighted by variances.
-        A group comes several times; the products of the groups `contained` in it are to be
-        subtracted. ``features``: of rows, and of their slice among all rows, to vectors (rows, 3,
-        width) in the coordinates of `Rows.target`; called with some thousand rows at a time, so
-        that memory does not grow with their number.
+        Columns are decorrelated and in the axes of the channels, not weighted by variances. A
+        group comes several times; of its sum the Gram matrices of the groups that it contains
+        (`contained`) are to be subtracted. ``features``: function from rows, and their slice
+        among all rows, to vectors (rows, 3, width) in the coordinates of `Rows.target`; called
+        with some thousand rows at a time, so that memory does not grow with their number.
         """
         # Rows that are correlated along the path are taken whole.
         most = len(self.rows) + 1 if self.rows.decorrelation else GRAM_ROWS
@@ -293,11 +300,12 @@ class NoiseModel:
     def _parts(
         self, rows: Rows, values: FloatArray, first: int
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (error group, vectors whose squares add up to its sum of squares).
+        """Yield (index of error group, its vectors): their squares add up to its sum of squares.
 
-        For 'frames' these are the frames' means, which contain the poses' means (`contained`).
-        ``rows``: whole groups of rows from the group with index ``first`` on; ``values``:
-        vectors in the axes of the channels, (n, 3, ...).
+        For groups of kind 'frames' these are the frames' means, weighted, which contain the
+        poses' means (`contained`). ``rows``: whole poses, the first being that with index
+        ``first`` in all rows' groups; ``values``: vectors in the axes of the channels, (n, 3,
+        ...).
         """
         shape = (-1, *(1,) * (values.ndim - 1))
         means = frames = values
@@ -342,8 +350,9 @@ class NoiseModel:
     ) -> NDArray[Any]:
         """Vectors (n, 3, ...) in units of the noise: independent, with variance 1 in all rows.
 
-        If a sensor's noise depends on the direction, the vectors are in the rows' `frames`.
-        ``out``: where to write them, of the same shape.
+        If a sensor's noise depends on the direction (`frames` is not None), their axes are the
+        line of sight and two across it. ``out``: array of the same shape to write them to,
+        which is returned; None for a new one.
         """
         white = np.empty_like(values) if out is None else out
         parts = self._of_groups(noise)
@@ -381,9 +390,11 @@ def _whitened(
     pose_sigma: FloatArray,
     frame_sigma: FloatArray,
 ) -> NDArray[Any]:
-    """Vectors in the axes of the channels, (n, 3, c), in units of the noise of each group.
+    """Vectors (n, 3, c) in units of the noise: independent, with variance 1.
 
-    ``sigma, pose_sigma, frame_sigma``: by group and axis, m, (groups, 3).
+    Errors common to a frame or a pose are taken account of. ``flat``: the vectors, in the axes
+    of the channels, (n, 3, c), not changed; ``sigma, pose_sigma, frame_sigma``: by group
+    (pose) of ``rows`` and axis, m, (groups, 3).
     """
     kind = flat.dtype
     size, count = rows.mean_frame_size[:, None], rows.group_frames[:, None]

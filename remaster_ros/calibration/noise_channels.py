@@ -48,9 +48,11 @@ class ErrorGroup:
 
 
 def error_groups(channels: Sequence[Channel], rows: Rows) -> tuple[ErrorGroup, ...]:
-    """Error groups of each channel, by frame sizes; none without independent errors.
+    """Error groups of each channel, in the order of the channels; groups without errors left out.
 
-    In the order of the channels, each 'rows', then 'frames' and 'poses' by ascending size.
+    For each channel that of kind 'rows' (rows' deviations from their frame's mean), then for
+    each size of frame that of 'frames' (frames' from their pose's mean), and 'poses' (poses'
+    means) by number of frames; sizes and numbers ascend.
     """
     found = []
     for index, channel in enumerate(channels):

@@ -76,9 +76,9 @@ class NoiseCheck(Struct, frozen=True):
     ) -> Self:
         """Comparison of an error with the noise; arguments as the attributes.
 
-        Explained: an error of at most 2.5 (`MOST`) times the mean length of the noise, with a
-        factor for few poses; None if the noise is unknown and the error below that of no
-        instrument.
+        ``explained`` is True for an error of at most 2.5 (`MOST`) times the mean length of the
+        noise, with a factor for few poses; False for a larger one, or one that no instrument
+        has (`is_of_no_instrument`); else None, if the noise is unknown.
         """
         check = cls(None, after_m, None, stated_m, within_m, **more)
         std, explained = check.noise_std_m, None

@@ -58,9 +58,10 @@ class OffsetDifferences:
 
     @property
     def words(self) -> str:
-        """Joints that differ by over 3 standard deviations, each with its number, as text.
+        """Joints that differ by over 3 standard deviations, as text, with that number of each.
 
-        Without any: '<all joints> taken together'.
+        Such as 'a by 4 and b by 7 standard deviations'; 'a, b and c taken together', with all
+        joints, if there is no such joint.
         """
         shown = [
             f'{joint} by {abs(by):.0f}'
@@ -104,7 +105,10 @@ def offset_differences(first: Estimate, second: Estimate) -> OffsetDifferences |
 
 @dataclass(frozen=True, eq=False)
 class _SessionOffsets:
-    """Zero-offsets of a session, rad or m; k joints, m links and axes."""
+    """Zero-offsets of a session, rad or m, and their response to errors of the arm's geometry.
+
+    k joints, m geometric errors.
+    """
 
     offsets: FloatArray  # (k,)
     known: BoolArray  # Whether the session determines each, (k,)
@@ -115,9 +119,10 @@ class _SessionOffsets:
 
     @classmethod
     def of(cls, found: Estimate) -> _SessionOffsets:
-        """Zero-offsets of a fit, with their covariance and response to links and axes.
+        """Zero-offsets of a fit, with covariance, and their response to geometric errors.
 
-        Standard deviations are at least those of the robust estimate.
+        Geometric errors are a displacement and a tilt of each joint's frame. Standard
+        deviations are at least those with smooth errors outside the model (`robust_std`).
         """
         mode, problem = found.mode.of_points, found.problem
         posterior = mode.linearisation.posterior

@@ -52,8 +52,8 @@ class OrientationInformation:
 def orientation_information(mode: Mode) -> OrientationInformation | None:
     """Comparison of a fit with that of the positions alone, linear about its mode.
 
-    None if no orientations are fitted. If the positions alone do not determine the parameters, the
-    std without is infinite, the shift 0 and the probability 1.
+    None if no orientations are fitted. If the positions alone do not determine the parameters,
+    ``std_without`` is infinite, ``shift`` 0 and ``p_value`` 1.
     """
     posterior = mode.linearisation.posterior
     if not posterior.rows.turning:
@@ -132,12 +132,14 @@ def orientation_accuracy(
     chosen: IntArray,
     pairs: IntArray,
 ) -> dict[str, Any]:
-    """Errors of orientations before and after, as fit.json has them, in degrees.
+    """Errors of orientations with offsets at zero and as estimated, as fit.json has them, degrees.
 
-    {} if the chosen rows have no orientation; 'relative_orientation' has a reason ``why`` in place
-    of numbers without pairs. ``measurements``: n observations; ``modelled``: orientations of the
-    same rows; ``fitted``: rows that determine R_T_B of every sensor and marker; ``chosen``: rows
-    that are judged; ``pairs``: joint solutions of the same pose, (m, 2).
+    Keys 'post_registration_orientation' and 'relative_orientation', each with 'before' and
+    'after'; {} if the chosen rows have no orientation, and None with a reason ``why`` in place
+    of the relative numbers without pairs. ``measurements``: n observations; ``modelled``:
+    orientations of the same rows; ``fitted``: rows that determine R_T_B of every sensor and
+    marker; ``chosen``: rows that are judged; ``pairs``: joint solutions of the same pose, (m,
+    2).
     """
     assert measurements.orientation is not None
     seen = np.all(np.isfinite(measurements.orientation), axis=1)

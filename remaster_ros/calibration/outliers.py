@@ -92,11 +92,13 @@ def find_outliers(
 
 
 def judge(rows: Rows, errors: FloatArray, gross: BoolArray) -> Judgement:
-    """Judgement of every row by the rows that are not gross yet.
+    """Judgement whether each row is a gross error, by the rows that are not gross yet.
 
-    A row is compared with the other rows of its pose, a pose of several rows with the other poses;
-    gross is a probability above 99 % (`CERTAIN`), and both halves of a reading with orientation
-    are. ``errors``: m (rad), (n, 3); ``gross``: mask of rows that do not count, (n,).
+    A row is compared with the other rows of its pose. The mean error of a pose with several
+    rows is compared with those of the other poses; if it is gross, all rows of the pose are.
+    Gross means a probability above 99 % (`CERTAIN`); a gross position makes the orientation of
+    the same reading gross, and the reverse. ``errors``: m (rad), (n, 3); ``gross``: mask of
+    rows that do not count, (n,).
     """
     group = rows.group_of_row
     sensor = rows.group_sensor[group]
@@ -272,7 +274,10 @@ def _names(rows: Rows, sensor_names: Sequence[str]) -> list[str]:
 
 
 def _size(error: float, turned: bool) -> str:
-    """Error in m as text in mm; if ``turned`` one in rad in degrees."""
+    """Size of an error as text: '1.2 mm' for a length in m, '0.12 degrees' for an angle in rad.
+
+    ``turned``: whether the error is an angle.
+    """
     return f'{np.degrees(error):.2f} degrees' if turned else f'{error * 1e3:.1f} mm'
 
 

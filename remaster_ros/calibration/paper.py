@@ -208,8 +208,9 @@ def _paper_natural(
 def _paper_gauge(gauge: Gauge, model: Model) -> Gauge:
     """Gauge in which `fixed_by` and `why` say what fixes each direction in the paper's fit.
 
-    Directions are those of the null space. One that a joint held at zero fixes (``gauge.held``)
-    is fixed by nothing there, as priors are flat; any other by markers taken as exact.
+    Directions are those of the given gauge. If that fixes one by a joint held at zero, nothing
+    fixes it in the paper's fit, whose priors are flat; any other is fixed by taking markers as
+    exact.
     """
     held_joints = {f'{model.names[index]} = 0' for index in gauge.held}
     directions, why = [], list(gauge.why)

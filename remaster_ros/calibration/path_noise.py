@@ -109,10 +109,11 @@ class Decorrelation:
         frame_size: IntArray,
         frames: slice,
     ) -> Decorrelation:
-        """Factors of the correlations of a sensor's frames.
+        """Matrices that decorrelate a sensor's rows, for runs of at most `MOST_FRAMES` frames.
 
-        ``source``, ``marker``: of all rows, (n,); ``frame_start``, ``frame_size``: of all frames;
-        ``frames``: those of the sensor.
+        ``source``, ``marker``: index in the measurements, and marker, of all n rows, (n,);
+        ``frame_start``, ``frame_size``: first row and number of rows of all frames;
+        ``frames``: slice of the frames of the sensor.
         """
         runs = []
         parts = -(-(frames.stop - frames.start) // MOST_FRAMES)
@@ -269,10 +270,10 @@ def _of_markers(
 ) -> tuple[float, float]:
     """Share and scale of the process in the deviations of single markers, by likelihood.
 
-    (0.0, 1.0) if there is one marker, or none in more than half of the frames. ``deviations``:
-    from the frames' means, m, (n, 3), of the rows of the first ``frames`` frames and others;
-    ``frame, marker``: of these rows, (n,); ``distance``: between the frames, (f, f); ``order``:
-    index into `ORDERS`.
+    (0.0, 1.0) if there is one marker, or if each marker is in half of the frames or fewer.
+    ``deviations``: of rows from their frames' means, m, (n, 3), of which those of the first
+    ``frames`` frames are used; ``frame, marker``: of these rows, (n,); ``distance``: between
+    the frames, (f, f); ``order``: index into `ORDERS`.
     """
     series: dict[bytes, tuple[IntArray, list[FloatArray]]] = {}
     for candidate in np.unique(marker):
@@ -344,9 +345,9 @@ def _correlations(distance: FloatArray, share: float, order: int) -> FloatArray:
 def _inverse_factor(correlations: FloatArray) -> FloatArray:
     """Matrix (f, f) that decorrelates f errors with correlations (f, f).
 
-    The inverse Cholesky factor, times the root of the share of variance that is scatter about
-    the errors' mean: the mean of a slow process over a path is none, as a registration absorbs
-    it.
+    The inverse Cholesky factor, times the root of one minus the mean correlation
+    (`scatterless`): the part of the errors that is constant over the path is absorbed by the
+    registration, and cannot be seen in the scatter.
     """
     factor = np.linalg.cholesky(correlations)
     inverse = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)

@@ -102,7 +102,9 @@ def predict(
     measurements
         Those that were fitted, in the model's order of sensors and markers.
     widening
-        Factor on standard deviations; None to determine it from the fit and its poses.
+        Factor on standard deviations; None to determine it: at least 1, as much as the noise's
+        uncertainty takes, and, with enough rows (`FEWEST_ROWS`), so that 95 % of the fitted
+        rows are in their regions if predicted without their pose.
     """
     model, draws = fit.predictive.model, fit.predictive.draws
     root = (draws - draws.mean(axis=0)) / np.sqrt(max(1, len(draws) - 1))
@@ -163,7 +165,7 @@ def squared_distances(errors: FloatArray, covariance: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _RowBlock:
-    """Rows with the parts of their covariance, in the references' base coordinates."""
+    """Predictions of some rows and the parts of their covariance, in R by the references."""
 
     # n rows, with the index of each row's sensor, (n,)
     rows: Rows

@@ -112,9 +112,11 @@ class PredictedAccuracy(NamedTuple):
 def predicted_accuracy(
     predictive: Predictive, seen: Measurements, count: int, rng: np.random.Generator
 ) -> PredictedAccuracy:
-    """Invariant accuracy at ``count`` random configurations (`random_configurations`).
+    """Predicted accuracy at ``count`` random configurations, with registrations drawn, too.
 
-    Marker positions by the estimate and their mean distances to those by draws of the posterior.
+    Marker positions by the estimate, and their mean distances from those by draws of all
+    parameters. Configurations are of `random_configurations`; ``seen``: measurements that it
+    takes sensors and markers from.
     """
     core = predictive.without_extension()
     m = random_configurations(core.model, seen, count, rng)
@@ -143,9 +145,10 @@ class ToolPlaces(NamedTuple):
 def tool_places(
     predictive: Predictive, seen: Measurements, row: int, count: int, rng: np.random.Generator
 ) -> ToolPlaces:
-    """Positions of the marker at the configuration of a row, by draws; the paper's version.
+    """Positions of the marker at the configuration of a row, by draws of the offsets.
 
-    ``seen``: measurements; ``row``: index of the row; ``count``: largest number of draws.
+    The paper's version: only offsets are drawn, the marker is that of the estimate. ``seen``:
+    measurements; ``row``: index of the row; ``count``: largest number of draws.
     """
     core = predictive.without_extension()
     model, taken = core.model, rng.permutation(len(core.draws))[:count]
@@ -170,11 +173,13 @@ def theoretical_distances(
     chosen: IntArray,
     rng: np.random.Generator,
 ) -> tuple[Distances, Distances]:
-    """Distances of section V-C at rows of the measurements: invariant version, and the paper's, m.
+    """Predicted errors of section V-C at rows of the measurements, m, in two versions.
 
-    ``before``: pinned parameters with offsets at zero, (size,), further entries are ignored;
-    ``measurements``: all rows of the session (those that the extension was made for); ``chosen``:
-    indices of the rows; of more than 10,000 a random sample is taken.
+    First the invariant version: positions in the sensor's frame, with all parameters drawn;
+    then the paper's: in the robot base, with only the offsets drawn. ``before``: pinned
+    parameters with offsets at zero, of which the first (size,) are used; ``measurements``: all
+    rows of the session (those that the extension was made for); ``chosen``: indices of the
+    rows; of more than 10,000 a random sample is taken.
     """
     rows = rng.permutation(chosen)[:MOST_ROWS]
     draws, before = len(predictive.draws), before[: predictive.model.size]
@@ -198,9 +203,10 @@ def _block(
     taken: IntArray,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Both versions of the four `Distances` of some rows and draws, m, (2, 4, pairs).
+    """The four `Distances` of some rows and draws, m, (2, 4, pairs): invariant, then the paper's.
 
-    ``before``: pinned parameters with offsets at zero, (size,); ``taken``: indices of the draws.
+    Versions as of `theoretical_distances`. ``before``: pinned parameters with offsets at zero,
+    (size,); ``taken``: indices of the draws.
     """
     model, draws = predictive.model, predictive.draws[taken]
     sensor = rows.group_sensor[rows.group_of_row]

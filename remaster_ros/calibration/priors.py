@@ -82,8 +82,9 @@ def offset_prior(model: Model, joint: int, mean: float, std: float) -> Prior:
 def plausible_offsets(model: Model, joints: Sequence[int]) -> Prior:
     """Gaussian prior about 0 of joint offsets (indices), std 5 degrees (`OFFSET_STD`).
 
-    22 mm for a joint that slides. With effects in the model: about the offsets with which the
-    effects were searched, with ``step_std`` of the extension.
+    22 mm for a joint that slides. If the model has effects found by discovery: about the
+    offsets at which these were found (``joint_offsets`` of the extension), with its
+    ``step_std``.
     """
     indices = list(joints)
     effects, per_radian = model.extension, model.chain.per_radian[indices]

@@ -144,7 +144,10 @@ class AdaptedProposal:
         return self._points(self.centre.mean + 2.0 * (inner - self.centre.mean))[0]
 
     def adapted(self, drawn: Weighted) -> AdaptedProposal:
-        """Proposal with the mean and covariance of weighted draws, tempered if too few."""
+        """Proposal with the mean and covariance of weighted draws.
+
+        If too few draws are effective, weights are tempered first (`Weighted.with_moments`).
+        """
         weight = drawn.with_moments()
         inner = self._inner(drawn.points)[0]
         mean = weight @ inner
@@ -155,9 +158,10 @@ class AdaptedProposal:
         )
 
     def _points(self, inner: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Points (n, d) of inner coordinates (n, d), and their log density (n,).
+        """Points (n, d) of inner coordinates (n, d), and the log density of the points (n,).
 
-        Negative common parts of the noise are mirrored at zero, in ``inner`` itself too.
+        Inner coordinates are the whitened parameters, then the noise (see the class). Negative
+        common parts of the noise are mirrored at zero, in ``inner`` itself too.
         """
         inner[:, self.dimension - self._shares :] = np.abs(
             inner[:, self.dimension - self._shares :]
@@ -169,9 +173,11 @@ class AdaptedProposal:
         return points, self._log_density(inner) + log_determinant(factor)
 
     def _inner(self, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Inner coordinates (n, d) of points (n, d), and the log of the volume ratio (n,).
+        """Inner coordinates (n, d) of points (n, d), log determinant, density of the noise.
 
-        Last result: the marginal log density of the noise, (n,).
+        Inner coordinates are the whitened parameters, then the noise (see the class). The log
+        determinant, of inner coordinates by points, (n,), is to be added to their log density.
+        Last result: marginal log density of the noise, (n,).
         """
         parameters, eta = np.split(points, [self.dimension - len(self.mode.eta)], axis=1)
         mean, factor, marginal = self._conditional(eta)
@@ -179,7 +185,11 @@ class AdaptedProposal:
         return np.concatenate((white, eta), axis=1), log_determinant(factor), marginal
 
     def _conditional(self, eta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """`Linearisation.conditional` of noise (n, e), clipped `FARTHEST` from the mode."""
+        """Gaussian of the parameters given noise coordinates (n, e): `Linearisation.conditional`.
+
+        Returns mean, Cholesky factor and log density of the noise. Coordinates further than
+        `FARTHEST` from the mode are replaced by those at that distance.
+        """
         # Outside, rounding removes the information. A proposal may use any function of the noise.
         clipped_eta = np.clip(eta, self.mode.eta - FARTHEST, self.mode.eta + FARTHEST)
         return self.mode.linearisation.conditional(clipped_eta)
@@ -190,9 +200,10 @@ class AdaptedProposal:
         return max(1, BLOCK_ENTRIES // self.dimension**2)
 
     def _log_density(self, inner: FloatArray) -> FloatArray:
-        """Log density (n,) of inner coordinates (n, d): main part and tails.
+        """Log density (n,) of inner coordinates (n, d).
 
-        The common parts of the noise count as mirrored at zero.
+        It is a mixture of the main Student t and one with wide tails. The common parts of the
+        noise count as mirrored at zero.
         """
         # |x| has the density of x and of -x together.
         kept = (1.0,) * (self.dimension - self._shares)
@@ -239,8 +250,8 @@ class Weighted(NamedTuple):
     def with_moments(self) -> FloatArray:
         """Weights (n,) with sum 1, tempered until the draws suffice for mean and covariance.
 
-        Suffice: 5 effective draws for each dimension (`DRAWS_PER_DIMENSION`); the weights are
-        raised to powers from 0.7 down, the lowest being 0.7^24.
+        They suffice with 5 effective draws for each dimension (`DRAWS_PER_DIMENSION`). If not,
+        the weights are raised to the power 0.7, 0.7², … until they do, at last to 0.7^24.
         """
         weight = self.weight
         for power in POWERS:

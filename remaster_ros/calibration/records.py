@@ -49,7 +49,7 @@ class Registration(Struct):
 
     @property
     def T_R_N(self) -> FloatArray:
-        """The same as a matrix, (4, 4). Raises ValueError if the quaternion is no rotation."""
+        """Registration as a matrix, (4, 4). Raises ValueError if the quaternion is no rotation."""
         return transform(matrix_from_quaternion_xyzw(self.rotation_xyzw), self.translation_m)
 
 

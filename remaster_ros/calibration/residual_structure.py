@@ -213,10 +213,10 @@ def _family_key(driver: str, sensor: str, degree: int) -> str:
 
 
 def _deviations(columns: FloatArray, middle: FloatArray) -> FloatArray:
-    """Deviations (n, 3, c) of columns from the means of their poses.
+    """Deviations (n, 3, c) of columns from the means of their poses, ``middle``, (n, 3, c).
 
-    If a pose is one configuration measured repeatedly, all quantities that the joints determine
-    are equal in its rows: the deviations are rounding and set to zero.
+    If a pose is one configuration measured repeatedly, all quantities that the joints
+    determine are equal in its rows: the deviations are rounding and set to zero.
     """
     deviations = columns - middle
     rounding = 1e-9 * np.linalg.norm(columns, axis=(0, 1))
@@ -319,13 +319,16 @@ def _f_test(
 def _from_pose_to_pose(
     remainder: FloatArray, basis: FloatArray, rows: Rows, seconds: FloatArray
 ) -> StructureTest | None:
-    """Test whether the mean error of a pose resembles that of the pose before.
+    """Test whether the mean error of a pose resembles that of the poses before and after it.
 
-    None if the model's parameters leave fewer than two numbers.
+    Poses of each sensor are in order of time (``seconds`` of the rows, (n,)). None if the
+    model's parameters leave fewer than two degrees of freedom. ``remainder``: means of g poses
+    less what the model's columns explain, (3 g, 1); ``basis``: of these columns, (3 g, b).
 
-    The remainder is M e with a projection M. Of the ratio e' M A M e / e' M e, A being half the
-    sum of both neighbours, mean and variance follow from traces; its distribution is nearly a beta
-    distribution (Durbin and Watson 1951, doi:10.1093/biomet/38.1-2.159).
+    The remainder is M e with a projection M. Of the ratio e' M A M e / e' M e, where A e is
+    half the sum of the errors of both neighbours, mean and variance follow from traces; its
+    distribution is nearly a beta distribution (Durbin and Watson 1951,
+    doi:10.1093/biomet/38.1-2.159).
     """
     time = rows.group_sum(seconds) / rows.group_size
     order = np.lexsort((time, rows.group_sensor))

@@ -379,8 +379,9 @@ def build_result(
 ) -> FitResult:
     """Summary of the draws: the result of a fit, with its tests.
 
-    ``seconds``: their computing time, None if it was not taken; ``rng``: for section V-C. The
-    comparison with offsets at zero is computed when it is read.
+    ``seconds``: computing time of the draws, None if it was not taken; ``rng``: for the
+    widening of the draws and for the theoretical metric. The comparison with offsets at zero
+    is computed when it is read.
     """
     posterior, gauge, measurements = sampled.posterior, sampled.gauge, problem.measurements
     model = posterior.model

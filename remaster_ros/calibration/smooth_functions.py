@@ -28,11 +28,11 @@ GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
 def evenly(count: int, share: float) -> IntArray:
-    """Indices, below ``count`` and ascending, of an even share of a sequence, with the first.
+    """Indices, ascending from 0, of an evenly spread ``share`` (0 to 1) of ``count`` elements.
 
-    The choice follows multiples of the golden ratio's inverse: the share is the same among every
-    second or third element, such as rows of several markers in turn, unlike with every k-th
-    element.
+    The choice follows multiples of the golden ratio's inverse: the share is the same among
+    every second or third element, such as rows of several markers in turn, unlike with every
+    k-th element.
     """
     return np.flatnonzero(np.arange(count) * GOLDEN % 1.0 < share)
 

@@ -119,9 +119,10 @@ def local_pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _end_with_parent() -> None:
-    """End this worker with status 1 once its parent has ended, killed too; returns at once.
+    """End this worker with status 1 once its parent process has ended or was killed.
 
-    A daemon thread waits for that; children of a scheduler are not concerned.
+    Returns at once: a daemon thread waits for that. Only for workers of this computer, which
+    were spawned, not for those of a Dask scheduler.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None

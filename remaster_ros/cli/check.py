@@ -79,9 +79,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Judge a session against the baseline, add it to the history, print the result; return 0.
 
-    A session that cannot be judged is not added; the newest check of the history is judged again
-    without being added. Raises InputError for a session that is an older check, of another arm, or
-    measured moving, and for an invalid file.
+    A session that cannot be judged is not added. If the session is the newest check of the
+    history already, it is judged again, and not added a second time. Raises InputError for a
+    session that is an older check, of another arm, or measured moving, and for an invalid
+    file.
     """
     session, baseline = read_session(args.session), read_compensation(args.baseline)
     refuse_moving(session, args.session, 'check')
@@ -323,10 +324,10 @@ def _next_date(found: CheckResult) -> str | None:
 
 
 def _next_in_words(found: CheckResult) -> str:
-    """Sentence on the next check: a date if `_next_date` has one.
+    """Sentence on the next check: its date if `_next_date` has one.
 
-    Else after so many usual intervals (`next_in`, rounded up), or, if that is 1, to go on as
-    usual.
+    Without a date, after how many times the usual interval between checks (`next_in`, rounded
+    up); if that is 1, to go on with the usual checks.
     """
     if (date := _next_date(found)) is not None:
         return f'Next check on {date}.'

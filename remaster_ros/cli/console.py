@@ -63,7 +63,7 @@ def _duration(seconds: float) -> str:
 def tell(args: argparse.Namespace, content: Mapping[str, Any], *lines: str) -> None:
     """Print one JSON object with --json; else the non-empty lines, unless --quiet.
 
-    With --json also if it is quiet.
+    ``content``: the object, which is printed even with --quiet; ``lines``: text for people.
     """
     if args.json:
         print(json.dumps(content))

@@ -122,9 +122,10 @@ def run(args: argparse.Namespace) -> NoReturn:
 def _collection(candidates: int | None, hidden: bool) -> dict[str, object]:
     """Return the parameters of the demo's collection: cell and numbers of candidates.
 
-    ``candidates``: as given, None for none; ``hidden``: whether causes are looked for. With
-    neither it is the cell with an optimal design, which keeps the fewest poses that a search
-    for causes needs; a demo that looks for causes visits more of them.
+    ``candidates``: number of candidate poses given by the user, None for none; ``hidden``:
+    whether causes are looked for. Without both the cell is 'quick', with an optimal design
+    that has the fewest poses that a search for causes needs; else it is 'demo', with that
+    number of candidates, or by default with enough to visit more poses.
     """
     if candidates is None and not hidden:
         return {

@@ -274,7 +274,8 @@ def _narrowed(
 ) -> tuple[CellProposal, Plan]:
     """Return the proposal with ranges around the usable poses, and these poses.
 
-    The ranges stay as they are with fewer than `FEWEST` of `TRIED` poses; `kept` says so.
+    Of `TRIED` candidates; if fewer than `FEWEST` are usable, the ranges stay as they are. The
+    proposal's text `kept` says which of the two.
     """
     scene = cell.planning_scene(p.chain, without_meshes=bool(p.missing_meshes))
     plan = scene.plan(TRIED, scene.rough_R, rng)

@@ -81,9 +81,10 @@ def build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _mending(args: argparse.Namespace, options: str) -> str:
-    """Return the command that writes the session again with `options`, which correct its mistake.
+    """Return the command line by which a person corrects the mistake in a session.
 
-    For several sessions a sentence on what to do.
+    It writes a copy of the session by ``remaster import`` with ``options``, which state the
+    correction. For several sessions a sentence that tells to fit each by itself.
     """
     given = args.session if isinstance(args.session, list) else [args.session]
     if len(given) > 1:

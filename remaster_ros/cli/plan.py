@@ -241,7 +241,8 @@ def _check_moving(
 ) -> None:
     """Raise InputError if this cell or --separate does not allow measuring in motion.
 
-    For a cell the error has the time that stop and go would take instead.
+    If it is the cell, the error also says how long the collection would take with stops
+    instead.
     """
     if args.separate:
         raise InputError(

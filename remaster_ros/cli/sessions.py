@@ -36,10 +36,11 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
 
 
 def _one_arm(session: Session, folder: Path) -> Session:
-    """Return the session unchanged, unless a correction was on for some of its rows only.
+    """Return the session unchanged, if its reported joint angles mean the same in all rows.
 
-    Raises InputError then, but only for a correction in the controller, with which reported
-    angles mean two things. ``folder``: for the error.
+    They do not if a correction inside the controller was on for some rows and off for others:
+    then InputError is raised. Corrections made outside of the controller pass. ``folder``: for
+    the error.
     """
     on = session.is_corrected
     correction = session.correction

@@ -143,10 +143,11 @@ def _on(session: Session, folder: Path) -> BoolArray:
 
 
 def _wanted(session: Session, folder: Path, on: BoolArray) -> FloatArray:
-    """Return the desired joint angles, rad, (n, k): the columns ``wanted`` of the session.
+    """Return the desired joint angles of each row, rad, (n, k): the session's columns ``wanted``.
 
-    If these are empty in a row, its reported angles, if the correction was on (``on``, (n,))
-    and is inside the controller. Raises InputError, with the ``folder``, if a row has neither.
+    In a row without these, the reported angles are taken if the correction was on (``on``,
+    (n,)) and is made inside the controller. Raises InputError, with the ``folder``, for the
+    first row that has neither.
     """
     m = session.measurements
     wanted = np.full_like(m.q, np.nan) if m.wanted is None else m.wanted.copy()

@@ -64,7 +64,8 @@ class Announcements:
     def announced(self, stamp: str, now: float) -> None:
         """Note an announcement at `now`, wall time, s; it counts as missed after a wait.
 
-        The wait is `ANNOUNCE_WALL_S`; with an unchanged stamp twice the last one, up to
+        ``stamp``: of the announcement. The wait is `ANNOUNCE_WALL_S`; for a repetition, which
+        has the same stamp as the announcement before, it is twice the wait before, at most
         `LONGEST_WALL_S`.
         """
         is_repeated = stamp == self.stamp
@@ -77,10 +78,10 @@ class Announcements:
     def lack(self) -> Lack:
         """Return whether, and how, the visit under way has to be announced (again).
 
-        `Lack.ANEW` if it was not announced, or a node that does not show it was started since.
-        `Lack.LATE` if a node still shows another pose after the wait of `announced`. While the
-        recorder measures nothing is announced, since the outcome changes the remaining
-        solutions.
+        `Lack.ANEW` if it was not announced, or if bridge or recorder shows another pose and
+        was started since the announcement. `Lack.LATE` if the last state of one of them shows
+        another pose and came after the wait of `announced`. Else `Lack.NOTHING`; also while
+        the recorder measures, since the outcome changes the remaining solutions.
         """
         if (recorder := self._peers.recorder) is not None and recorder.state == 'measuring':
             return Lack.NOTHING
@@ -98,5 +99,5 @@ class Announcements:
         return [(node, heard) for node, heard in states if heard is not None]
 
     def retract(self) -> None:
-        """Discard the stamp, so that the remaining solutions are announced with a new one."""
+        """Forget the announcement, so that what remains is announced with a new stamp."""
         self.stamp = ''

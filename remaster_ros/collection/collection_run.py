@@ -104,9 +104,10 @@ class CollectionRun:
     ) -> str:
         """Return why /remaster/collect does not begin or resume a run; '' if it does.
 
-        ``bridge, recorder``: last states, None before the first; ``has_joints``: whether the arm's
-        configuration is known; ``further``: why nothing is added to a complete collection, '' if
-        something is, None if that is not the question.
+        ``bridge, recorder``: last states, None before the first; ``has_joints``: whether the
+        arm's configuration is known; ``further``: of a complete collection, why no
+        measurements are added to it, or '' if some are; None if no addition was requested:
+        then a complete one is refused.
         """
         if not has_joints:
             return 'no joint_states yet: is the robot running?'

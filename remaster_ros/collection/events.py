@@ -64,7 +64,10 @@ class PlannerState(Body, frozen=True, kw_only=True, tag='planner'):
     further: str = ''
 
     def goes_further(self, plan: str) -> bool:
-        """Whether the present run continues the complete collection of a plan."""
+        """Whether the present run adds measurements to the complete collection of a plan.
+
+        ``plan``: id of the plan; False for ''.
+        """
         return self.state == 'running' and self.further == plan != ''
 
     def run_held(self, before: str) -> str:

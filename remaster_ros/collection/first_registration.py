@@ -100,12 +100,13 @@ class FirstRegistration:
         return registered
 
     def _frame(self, options: Sequence[FloatArray], measured: FloatArray) -> FloatArray:
-        """Registration, (4, 4), by the choice of markers that agrees best.
+        """Registration, (4, 4), by the assignment of markers to points that agrees best.
 
-        That has most points within `allowed_m`, then the least RMS. ``options``: places in the
-        robot base frame that each point may have, m, (m, 3) each; ``measured``: in the
-        sensor's frame, (n, 3), m. Raises InsufficientDataError if no choice gives a
-        registration, or another one agrees as well (`CLEARLY_WORSE`).
+        Best: most points within `allowed_m`, then the least RMS. ``options``: for each point
+        the positions in the robot base frame of the markers that it may be of, m, (m, 3) each;
+        ``measured``: points in the sensor's frame, (n, 3), m. Raises InsufficientDataError if
+        no assignment gives a registration, or another one that differs agrees as well
+        (`CLEARLY_WORSE`).
         """
         failure: InsufficientDataError | None = None
         found = []

@@ -77,9 +77,11 @@ class JointOrder:
 
 
 def wanted_of(message: Any, joint_names: Sequence[str]) -> FloatArray | None:
-    """Wanted positions of a settled arm, before a correction, rad, (k,).
+    """Wanted joint positions, before a correction, in the message of a settled arm, rad, (k,).
 
-    None without a correction. ``joint_names``: of the arm, whose order the positions have.
+    None if the message names no wanted joint, as no correction was applied. ``message``: joint
+    states that name the wanted joints with a prefix; ``joint_names``: the arm's joints,
+    without it, in the order of the result.
 
     Raises InputError as `JointOrder.positions`.
     """

@@ -225,9 +225,10 @@ class Pairing:
     def end_as_recorded(self, result: str, reason: str) -> None:
         """Decide on every sensor now, at the point where the recorder of a bag had decided.
 
-        Some sensors are not decided by their messages: their time was over, their nodes were
-        absent, or their devices answered that there is no measurement. ``result, reason``: as
-        published by the recorder (`events.ConfigurationEnded`).
+        A sensor without a decision is decided by its readings if its time is over and they are
+        usable. Otherwise it is rejected: as ``absent`` if the recorder's result was
+        ``recorded``, else as ``stale``. ``result, reason``: as published by the recorder
+        (`events.ConfigurationEnded`); the reason becomes the detail of these rejections.
         """
         for name, rules in self.rules.items():
             if name in self.decided:
@@ -243,9 +244,10 @@ class Pairing:
     def _add_silence(
         self, counts: Mapping[str, int], passed_s: float, absent: Collection[str]
     ) -> None:
-        """Add to the time without messages of each sensor's node that is not excused yet.
+        """Add the time since the last call to the silence of each sensor's node, s.
 
-        It begins anew at 0 with a message, for an absent sensor, and for one without a count.
+        Silence: time without a message of the node, as far as it is not excused. It is set to
+        0 if a message came, if the sensor is absent, or if ``counts`` does not have it.
         ``counts``: number of messages by sensor; ``passed_s``: time since the last call, s.
         """
         for name in self.rules:
@@ -303,7 +305,10 @@ class Pairing:
             self._set(Rejection(name, reason, detail))
 
     def _allowed_s(self, rules: SensorRules) -> float:
-        """Longest wait for a sensor after the settling, s."""
+        """Longest wait for a sensor after the settling, s, with the time excused by its absence.
+
+        Infinite if the pairing is ``patient``.
+        """
         return np.inf if self._patient else rules.allowed_s + self._excused_s[rules.sensor]
 
     def _late(self, rules: SensorRules, allowed: float) -> Rejection:
@@ -362,10 +367,13 @@ class Pairing:
     def _used(
         self, rules: SensorRules, *, waits: bool = True
     ) -> tuple[float, dict[str, list[MarkerReading]]] | None:
-        """End of a measurement and each marker's readings in it; None while it lasts.
+        """End of a measurement, s, and each marker's visible readings; None while it lasts.
 
-        Markers with fewer than `min_samples` readings up to the end are left out, unless all have
-        fewer. With ``waits`` False a marker without a reading is hidden.
+        A single-shot sensor: the first reading of each marker. A stream: the readings until
+        the end of the dwell; if no marker has `min_samples` by then, until the first marker
+        has so many. Markers with fewer are left out. ``waits``: whether to wait for messages
+        of every marker of the sensor; if False, those that have sent none are taken to be
+        hidden.
         """
         if not self._readings[rules.sensor]:
             return None

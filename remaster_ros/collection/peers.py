@@ -96,9 +96,10 @@ class RequiredSensors:
         self.any_of_them = require == 'any'
 
     def missing(self, absent: Mapping[str, str]) -> str:
-        """Sensors that have to come back before the arm continues, with reasons; ''.
+        """Sensors that have to come back before the arm continues, with reasons, as text.
 
-        ``absent``: absent sensors and reasons.
+        '' if there is none: no sensor that the arm waits for is absent, or, of `any_of_them`,
+        not all are. ``absent``: reason by name of each absent sensor.
         """
         gone = [name for name in self.names if name in absent]
         if not gone or (self.any_of_them and len(gone) < len(self.names)):
@@ -169,8 +170,9 @@ class Peers:
     def facts(self, now: float, *, seen_before: bool) -> Facts:
         """Present facts for the preflight; raises `InputError` as `required`.
 
-        ``seen_before``: whether the sensors have seen their markers in this session, so that the
-        arm may stand where they do not: in a collection that is resumed. ``now``: wall time, s.
+        ``seen_before``: whether the sensors have seen their markers earlier in this session,
+        as in a collection that is resumed: then the arm may stand where no marker is in view,
+        and the age of the readings is 0. ``now``: wall time, s.
         """
         required, bridge = self.required(), self.bridge or BridgeState(halted='')
         return Facts(

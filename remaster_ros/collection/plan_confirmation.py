@@ -108,9 +108,11 @@ class PlanConfirmation:
     def confirm(self, plan: str = '') -> tuple[bool, str]:
         """Confirm the plan that is shown; return whether that succeeded, and the answer.
 
-        ``plan``: fingerprint of the plan that the person has seen: no other is confirmed, however
-        late the request comes. '' for the plan on the page, which is refused if the page showed
-        another one before.
+        ``plan``: fingerprint of the plan that the person has seen; another one than the plan
+        on the page is refused, however late the request comes. '' for the plan on the page:
+        refused if the page has shown another, unconfirmed plan since the last confirmation,
+        which the person may mean. Refused as well if no plan is shown, or none has to be
+        confirmed.
         """
         if not self.required:
             return False, 'no plan waits for that; confirm: true in the cell file asks for it'

@@ -49,7 +49,8 @@ class SettledArm:
     def recorded_before(self, result: Outcome, *, registered: bool) -> ConfigurationEnded:
         """Event that this configuration was recorded before and needs no further reading.
 
-        ``registered``: whether every sensor that the arm waits for is registered.
+        ``result``: outcome that was recorded then; ``registered``: whether every sensor that
+        the arm waits for is registered.
         """
         return ConfigurationEnded(
             stamp=self.pose.stamp,
@@ -91,7 +92,7 @@ class EndedReading:
 
     @property
     def why(self) -> str:
-        """Reasons why sensors have no reading; ''."""
+        """Reasons why sensors have no reading, as one text; '' if no sensor was rejected."""
         return '; '.join(f'{r.sensor}: {r.reason}: {r.detail}' for r in self.rejected)
 
     def event(self, *, registered: bool) -> ConfigurationEnded:

@@ -277,10 +277,12 @@ class ReferenceWatch:
     def _noise(self, sensor: str, off: Displacements) -> Noise | None:
         """Noise of a sensor: std per axis, m, and degrees of freedom; None if unknown yet.
 
-        By the differences of successive rounds without an alarm: of the first two, and of later
-        ones as they come; unknown with fewer than `FEWEST_FREEDOMS`. A slow drift hardly changes
-        these, so that it is not taken for noise. At least the standard error of a mean over a
-        dwell by its own scatter, and `LEAST_STD_M`.
+        By the differences of successive rounds: of the first two, and of later ones in which
+        no change was found and between which none was accepted. Unknown with fewer than
+        `FEWEST_FREEDOMS` differences (each axis counts). A slow drift hardly changes them, so
+        that it is not taken for noise. The std is at least the standard error of a mean over a
+        dwell by its own scatter, and `LEAST_STD_M`. ``off``: measured minus nominal marker
+        positions, m, by round, reference and sensor.
         """
         quiet = [r.judged and not r.alarmed for r in self._rounds]
         steps = [
@@ -349,11 +351,12 @@ class ReferenceWatch:
     ) -> float:
         """p-value of the hypothesis that a round equals the first ones; 1.0 without any of these.
 
-        The smallest of several tests, times their number (Bonferroni), half of it for each
-        kind: all differences of a sensor, of any form; and the part of all differences that
-        each cause explains, which finds a change in one direction much sooner. ``number``:
-        index of the round; ``noise``: by sensor; sensors that are missing in it are left out;
-        ``off``: measured minus nominal marker positions, m.
+        Of several tests, in two groups: one for each sensor, of all its differences; and one
+        for each cause, of the part of all differences that it explains, which finds a change
+        in one direction much sooner. The result is the smaller of 2 × (smallest p-value ×
+        number of tests) of the groups (Bonferroni; it may exceed 1). ``number``: index of the
+        round; ``noise``: by sensor; sensors that are missing in it are left out; ``off``:
+        measured minus nominal marker positions, m.
         """
         first = [self._begin] if self._begin else [0, 1]
         places, stds, scaled = [], [], []
@@ -474,7 +477,7 @@ class ReferenceWatch:
 
 
 def _centered(values: FloatArray, group: IntArray) -> FloatArray:
-    """Values (n, ...) less the mean of their group, as the first value is unknown.
+    """Values (n, ...) less the mean of their group, to remove each group's unknown constant.
 
     ``group``: number of each value's group, (n,), from 0.
     """

@@ -80,8 +80,9 @@ class SetupChanges:
     ) -> None:
         """Restore the state of an earlier recorder from its log (`SessionJournal.watched`).
 
-        ``log``: kind (reference, accepted or other), configuration, readings. A change that stops
-        has `stopped_run` '' then: which run was stopped is not known.
+        ``log``: kind (reference, accepted or other), configuration, readings; ``T_R_N``:
+        registration of each sensor, (4, 4), by name. If the change found `stops` the
+        collection, `stopped_run` becomes '': which run was stopped is not known.
         """
         for kind, configuration, readings in log:
             if kind == 'reference':
@@ -101,10 +102,12 @@ class SetupChanges:
         T_R_N: Mapping[str, FloatArray],
         last: bool = False,
     ) -> bool:
-        """Process the readings at a reference; return whether there is a new change to report.
+        """Process the readings at a reference; return whether a new change is to be reported.
 
-        ``configuration``: its number in the session; ``T_R_N``: registrations; ``last``:
-        whether it is the last reference of its round, which is judged then.
+        ``configuration``: its number in the session; ``T_R_N``: registration of each sensor,
+        (4, 4), by name; ``last``: whether it is the last reference of its round. A round is
+        judged after its last reference, or before a reading that begins the next round; else
+        the result is False. New: as of `judge`.
         """
         new = False
         for reading in readings:
@@ -154,8 +157,10 @@ class SetupChanges:
     def follow(self, state: str, run: str) -> bool:
         """Process the planner's state; returns whether a person has checked the change.
 
-        A person has if another run has begun, as by /remaster/collect. A restarted recorder does
-        not know which run was stopped: it is the run found running, and after a pause none.
+        A person has if a change has stopped a run, and another run is under way, as by
+        /remaster/collect. A restarted recorder does not know which run was stopped
+        (`stopped_run` is ''): it takes the run that it finds running for that one or, if the
+        planner is paused, a run that differs from every later one; the result is False then.
         ``state, run``: the planner's state and the token of its run, '' for none.
         """
         if self.stopped_run == '':

@@ -58,7 +58,8 @@ class StoppingGoal:
     def of(cls, poses: PoseSettings) -> StoppingGoal:
         """Goal of a cell file, in rad and m; an empty one if it states none.
 
-        Empty also if an optimal design has to reach a precision that is not stated.
+        Empty also for an optimal design, if a precision that counts in it (of joints, of the
+        tool) is not stated.
         """
         stated = (poses.joint_std_deg, poses.tool_std_m)
         matters = (poses.tool_share < 1.0, poses.tool_share > 0.0)

@@ -156,9 +156,10 @@ class TourProgress:
     def next(self, q: FloatArray, sensors: RequiredSensors, words: str) -> PoseVisit | None:
         """Begin the next visit and return it; None while there is none to begin.
 
-        None while it is planned, while the arm cannot go on (`standing` has the reason), once
-        when the poses left to fit are dropped as enough is known, while registrations that the
-        recorder reports have not arrived, and at the end (`is_complete`).
+        None while it is planned, while the arm cannot go on (`standing` has the reason), in
+        the one call that drops the remaining poses to fit (as `enough` is set), while
+        registrations that the recorder reports have not arrived, and at the end
+        (`is_complete`).
 
         ``q``: configuration of the arm, rad, (k,); ``sensors``: must be registered before the
         collection; ``words``: state of the registration, for the message. Raises
@@ -251,12 +252,15 @@ class TourProgress:
 
     @property
     def planned(self) -> int:
-        """Number of configurations to fit as planned, without later additions; 0 before."""
+        """Number of configurations to fit as planned, without later additions; 0 before a plan."""
         return sum(tour.to_fit for tour in self._memory.tours if not tour.begin_at)
 
     @property
     def planned_any(self) -> bool:
-        """Whether the tour has configurations: there may be none that separate two causes."""
+        """Whether the present tour has configurations; False without a tour.
+
+        A tour to separate two causes has none if no configuration can separate them.
+        """
         tour = self._memory.tour
         return tour is not None and any(tour.configurations.values())
 
@@ -272,7 +276,11 @@ class TourProgress:
         return tour is not None and visit.split == REFERENCE and visit.index == tour.references - 1
 
     def state(self, state: str, run: str) -> PlannerState:
-        """Return the state message for the other nodes."""
+        """Return the state message for the other nodes.
+
+        ``state``: the planner's state, as in `PlannerState`; ``run``: token of its run, '' for
+        none.
+        """
         further = self._memory.id if self.measures_additions else ''
         return PlannerState(state=state, run=run, planned=self.planned, further=further)
 

@@ -255,10 +255,11 @@ class ArmModel:
         return drivers | ({'lateral'} if np.any(self.lateral_compliance) else set())
 
     def warming(self, rows: int, temperature_c: FloatArray | float | None) -> FloatArray:
-        """Temperature above the reference, K, (rows,); of `mean_c` if ``temperature_c`` is None.
+        """Temperature above the reference, K, (rows,).
 
-        ``rows``: number of rows; ``temperature_c``: °C, one number or (rows,). Zeros if
-        nothing depends on the temperature.
+        ``rows``: number of rows; ``temperature_c``: of the arm, °C, one number or (rows,);
+        None for the mean temperature of the measurements. Zeros if nothing depends on the
+        temperature.
         """
         if not self.grows:
             return np.zeros(rows)
@@ -545,9 +546,10 @@ class ArmModel:
     def derivative(self, state: State, sensor: str, marker: str) -> FloatArray:
         """Derivative of a marker's position by all p parameters, (n, 3, p), m per unit.
 
-        In the robot base frame R, relative to what ``sensor`` measures: a shift of the sensor
-        counts as the opposite shift of the arm; columns of other sensors and markers are 0.
-        Raises KeyError for an unknown marker.
+        In the robot base frame R, for the marker as ``sensor`` measures it: the columns of a
+        shift or rotation of this sensor are minus the motion of the marker by that shift or
+        rotation of the arm. Columns of other sensors and markers are 0. Raises KeyError for an
+        unknown marker.
         """
         n, k, drivers = len(state.angles), self.joints, state.drivers
         points = apply(state.tool, self.markers[marker])
@@ -602,9 +604,9 @@ _UNITS = {'gravity_moment': '(N m)', 'temperature': 'K'}
 def unit_of(function: Function, chain: SerialChain, unit_of_sum: str = 'rad') -> str:
     """Unit of a function's coefficients, such as 'rad/(N m)' or 'rad/K'.
 
-    ``unit_of_sum``: unit of the quantity to which the function is added. Coefficients of
-    linear and quadratic functions have it per unit of the driver (or its square), all others
-    have it as it is.
+    ``unit_of_sum``: unit of the quantity to which the function is added. The coefficients have
+    this unit; those of a linear function, divided by the unit of its driver; those of a
+    quadratic one, by the square of it.
     """
     if function.form not in ('linear', 'quadratic'):
         return unit_of_sum

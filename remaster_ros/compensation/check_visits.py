@@ -63,9 +63,10 @@ class CheckVisits:
         )
 
     def expected(self) -> list[str]:
-        """Line for each joint: name, and smallest change that one check finds, mm at the tool.
+        """Lines 'JOINT: SIZE mm' with the smallest change, at the tool, that one check finds.
 
-        Or 'none', if a moved sensor would have the same effect.
+        One for each joint. In place of the size: 'none: looks like a sensor that was moved',
+        if a moved sensor would have the same effect.
         """
         return [
             f'{name}: '

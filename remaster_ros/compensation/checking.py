@@ -80,7 +80,10 @@ class Measured:
     when_s: float = np.nan  # Unix time of the check, s; NaN if unknown
 
     def merged(self, chain: SerialChain) -> Measured:
-        """Return a copy with one mean reading per pose, sensor and marker, by first occurrence."""
+        """Return a copy with one mean reading for each pose, sensor and marker.
+
+        They are in the order in which each combination first occurs.
+        """
         rows: list[int] = []
         for row in range(len(self.q)):
             same = [
@@ -126,9 +129,10 @@ class Measured:
 
 
 def is_same_pose(chain: SerialChain, q: FloatArray, place: FloatArray) -> BoolArray:
-    """Mask of the configurations q (n, k) within 0.5 degrees of one configuration (k,), (n,).
+    """Mask of the configurations q (n, k) within 0.5 degrees (`SAME_RAD`) of ``place``, (n,).
 
-    In every joint (`SAME_RAD`); for a prismatic joint that angle times ``per_radian``.
+    ``place``: a configuration, (k,). Every joint has to be that near; a prismatic joint within
+    0.5 degrees, in rad, times ``per_radian``.
     """
     difference: FloatArray = np.abs(q - place) / chain.per_radian
     return np.asarray(difference.max(axis=1) <= SAME_RAD)
@@ -201,9 +205,10 @@ def seen(model: ArmModel, measured: Measured) -> CheckResiduals:
 
 
 def rigid_motions(points: FloatArray) -> FloatArray:
-    """Displacements of points (n, 3) by unit shifts and rotations of a sensor, (n, 3, 6).
+    """Displacements of points (n, 3) by unit shifts and rotations, (n, 3, 6).
 
-    Columns: shifts along x, y, z, then rotations about them, at the origin.
+    Columns: shifts along x, y, z, then rotations about the x, y, z axes through the origin (m
+    per rad), in the frame of the points.
     """
     turns = np.cross(np.eye(3), points[:, None, :]).swapaxes(1, 2)
     shifts = np.broadcast_to(np.eye(3), turns.shape)
@@ -276,8 +281,9 @@ def bayes_factors(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def evidence(x: FloatArray) -> FloatArray:
     """Evidence (e-process) for a step of the mean of series (…, T), against no step, (…).
 
-    Mean of the Bayes factors over all places j, which have the prior 1 / (j (j + 1)); 1 / T
-    remains for a step in the future. 1 for fewer than two results.
+    Sum of the Bayes factors for a step after result j = 1 … T - 1, times its prior 1 / (j (j +
+    1)). The rest of the prior, 1 / T, is for a step still to come, with the factor 1. For
+    fewer than two results the evidence is 1.
     """
     T = x.shape[-1]
     if T < 2:
@@ -308,9 +314,9 @@ def change(x: FloatArray) -> Change:
 
 
 def step(x: FloatArray, at: int) -> tuple[float, float]:
-    """Mean of a series (T,) from result ``at`` (1 to T - 1) on less that before, and its std.
+    """Mean of a series (T,) from index ``at`` on minus the mean before it, and its std.
 
-    The std is infinite for two results.
+    ``at``: 1 to T - 1. The std of this difference is infinite for two results.
     """
     T = len(x)
     deviations = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
@@ -322,9 +328,9 @@ def step(x: FloatArray, at: int) -> tuple[float, float]:
 def wander(x: FloatArray, at: int) -> float:
     """Half of the 95 % interval of the size of a step before result ``at``, with autocorrelation.
 
-    Means of consecutive results differ by more than their scatter predicts if days resemble
-    one another or there is a season: batch means, of a sixth of the series at most. 0 if there
-    are fewer than six batches (`BATCHES`).
+    Batch means: the deviations from the means before and after the step are averaged in
+    batches of consecutive results, so that slow changes of the series (T,) widen the interval.
+    0 for fewer than six results (`BATCHES`).
     """
     T = len(x)
     deviations = np.concatenate((x[:at] - x[:at].mean(), x[at:] - x[at:].mean()))
@@ -345,8 +351,10 @@ class JointCheck:
     Change, std: rad, or m for a prismatic joint; the detectable change: m at the tool; the
     lever: m per rad.
 
-    The change is that since the check that is named, or that of the newest check. If a moved
-    sensor has the same effect, all but the lever is NaN, and the evidence is 1.
+    If a joint or a marker is named as changed, ``change`` is that from the checks before the
+    change to those since; otherwise that from the mean of all earlier checks to the newest one. A
+    single check is compared with the correction's model. If a moved sensor has the same effect,
+    all but the lever is NaN, and the evidence is 1.
     """
 
     change: float
@@ -555,10 +563,11 @@ def _before_and_after(T: int, at: int) -> FloatArray:
 
 
 def _scatter(values: FloatArray, days: FloatArray, at: int) -> float:
-    """Standard deviation of results (T,) or (T, n) about a constant with a ramp from ``at`` on.
+    """Standard deviation of results about a constant with a ramp that begins at index ``at``.
 
-    The ramp is fitted over ``days``, the times, (T,), T > 2. For n series: the root of the sum
-    of their variances.
+    ``values``: results, (T,), or n series of them, (T, n), of which it is the root of the sum
+    of the variances; ``days``: times of the results, over which the ramp is linear, (T,), T >
+    2.
     """
     line = np.maximum(0.0, days - days[at])
     basis = np.linalg.qr(np.stack((np.ones(len(days)), line), axis=1))[0]
@@ -587,10 +596,10 @@ def _projected(check: CheckResiduals, taken: FloatArray) -> CheckResiduals:
 
 
 def _series(residuals_of_checks: Sequence[CheckResiduals]) -> FloatArray:
-    """Size of a change of each joint, and of each marker, in each of T checks, m, (T, k + 3 m).
+    """Sizes of changes fitted to the residuals of each of T checks, m, (T, k + 3 m).
 
-    By least squares: of a joint as if it alone had changed, m at the tool; of the m markers,
-    all together, x, y and z of each.
+    First of each of k joints, as if it alone had changed, m at the tool; then x, y and z of
+    each of m markers on the tool, all fitted together. By least squares, each with its sign.
     """
     rows = [
         (
@@ -613,10 +622,11 @@ def _single_column_sizes(columns: FloatArray, residuals: FloatArray) -> FloatArr
 
 
 def _noise(residuals_of_checks: Sequence[CheckResiduals], at: int) -> float:
-    """Noise of a reading per axis, m: scatter of checks about their means before and from ``at``.
+    """Noise of a reading per axis, m, from the scatter of the residuals of repeated checks.
 
-    ``at`` 0: about one mean. For a single check: RMS residual, which contains the correction's own
-    error.
+    About two means: of the checks before index ``at``, and of those from it on; about one mean
+    if ``at`` is 0. If neither part has two checks: RMS residual, which also contains the
+    errors that the correction leaves.
     """
     rests, freedom = (
         np.array([check.residuals for check in residuals_of_checks]),
@@ -671,8 +681,9 @@ def _is_doubtful(
 
     Evidence above 10 (`DOUBT`) for a change that may matter, or a newest check that is
     outlying (`_is_outlying`). ``x_m``: sizes of changes as of `_series`, (T, k + 3 m);
-    ``counts``: mask of those to consider; ``is_seen``: mask of joints that sensors cannot
-    imitate, (k,); ``smallest_m``: smallest change at the tool that matters, m.
+    ``counts``: mask of the columns of ``x_m`` to consider; ``is_seen``: mask of joints whose
+    effect no moved sensor can have, (k,); ``smallest_m``: smallest change at the tool that
+    matters, m.
     """
     found = [change(x_m[:, i]) for i in np.flatnonzero(counts)]
     best = max(found, key=lambda estimate: estimate.evidence)
@@ -687,9 +698,12 @@ def _is_outlying(
     counts: BoolArray,
     is_seen: BoolArray,
 ) -> bool:
-    """Whether the newest check is over 5 standard deviations (`BEYOND_STD`) from those before.
+    """Whether a change in the newest check is over 5 standard deviations (`BEYOND_STD`).
 
-    The only check: from the correction's model. Arguments as of `_is_doubtful`.
+    With four checks or more: the size of any considered change, from its mean over the earlier
+    checks. With fewer: the change of one joint, or of all markers, fitted to the difference of
+    the newest residuals from the earlier mean; for a single check, of one joint, fitted to its
+    residuals. Arguments as of `_is_doubtful`.
     """
     last, T = residuals_of_checks[-1], len(residuals_of_checks)
     if T > 3:
@@ -730,10 +744,11 @@ def _changed_joints(
 ) -> tuple[tuple[int, ...], bool]:
     """Indices of the joints that may have changed, and whether a marker may have moved instead.
 
-    All explanations by one joint, or the markers, within odds of 20 of the best
-    (`NAMING_ODDS`). ``weights``: (T,), the change of the readings is the sum of weights times
-    checks; ``noise``: of a reading per axis, m; ``is_seen``: mask of joints that sensors
-    cannot imitate, (k,).
+    Each joint, and the markers, are an explanation of the change of the residuals; returned
+    are those whose odds against the best one are within 20 (`NAMING_ODDS`). ``weights``: (T,),
+    factors with which the residuals of the T checks are summed to their change; ``noise``: of
+    a reading per axis, m; ``is_seen``: mask of joints whose effect no moved sensor can have,
+    (k,).
     """
     step = weights @ np.array([entry.residuals for entry in residuals_of_checks])
     variance = noise**2 * float(weights @ weights)

@@ -132,10 +132,11 @@ class Compensator:
         return self._rows(lambda rows, warm: rows + self._way_back(rows, warm), q, temperature_c)
 
     def correct(self, q: ArrayLike, temperature_c: ArrayLike | None = None) -> Correction:
-        """Commands (n, k), remaining errors, and rows out of range, for wanted angles (n, k).
+        """Commands (n, k) for wanted angles q (n, k), with the errors that remain.
 
-        ``temperature_c``: °C, one or (n,); None for the mean of the measurements. Raises
-        ValueError for another shape or numbers that are not finite.
+        Also masks of the rows that are not corrected in full, and of those beyond the measured
+        range of a curve. ``temperature_c``: °C, one or (n,); None for the mean of the
+        measurements. Raises ValueError for another shape or numbers that are not finite.
         """
         wanted = self._checked(q).reshape(-1, self.model.joints)
         warming = self.model.warming(len(wanted), _given(temperature_c))
@@ -176,10 +177,11 @@ class Compensator:
         """Mean square error of the marker's position, m², (..., 3, 3), along axes of the base R.
 
         The error is that in the frame of the sensor, at wanted joint angles after correction,
-        with the base frame and tool of the file: it contains the uncertainty of offsets,
-        causes, registration and marker, widened as poses that were left out have shown, and
-        the errors that the command leaves. If only zero-offsets are corrected, it contains
-        lengths and tilts that stay nominal.
+        with the base frame and tool of the file. It contains the uncertainty of offsets, other
+        corrected effects, registration and marker, times the factor ``widening`` of the file
+        (how much larger the errors at held-out poses are than expected), and the errors that
+        the command leaves. If only zero-offsets are corrected, it contains lengths and tilts
+        that stay nominal.
 
         Parameters
         ----------
@@ -204,9 +206,9 @@ class Compensator:
     ) -> FloatArray:
         """Square root L, m, (..., 3, r), of the mean square error of `uncertainty`, which is L L'.
 
-        A column is the effect of one uncertain quantity on the position in each row, so that
-        the errors of different rows can be combined; the last one is the error that the
-        commands leave. Arguments as of `uncertainty`.
+        Each of the r columns is the effect of one independent error on the position in every
+        row, so that the errors of different rows can be combined; the last one is the error
+        that the commands leave. Arguments as of `uncertainty`.
         """
         model = self.model
         q = self._checked(q)
@@ -231,10 +233,11 @@ class Compensator:
         q: ArrayLike,
         temperature_c: ArrayLike | None,
     ) -> FloatArray:
-        """Results of a function of rows (n, k) and warming, K, (n,), for angles (..., k).
+        """Angles that ``solve`` returns for angles q, (..., k) each, in blocks of rows.
 
-        In the shape of q; computed in blocks of rows. Raises ValueError for a wrong shape or
-        numbers that are not finite.
+        ``solve``: function of angles (n, k) and temperatures above the reference, K, (n,),
+        that returns angles (n, k); ``temperature_c``: °C, as in `command`. Raises ValueError
+        for a wrong shape or numbers that are not finite.
         """
         q = self._checked(q)
         rows = q.reshape(-1, self.model.joints)
@@ -268,9 +271,10 @@ class Compensator:
     def _solved(self, wanted: FloatArray, warming: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Commands (n, k), and the pose errors that they leave, m and rad, (n, 6).
 
-        ``wanted``: joint angles, (n, k); ``warming``: temperature above the reference, K,
-        (n,). No joint is changed by more than ``most_rad``, or its own error if that is
-        larger.
+        ``wanted``: joint angles, rad or m, (n, k); ``warming``: temperature above the
+        reference, K, (n,). A joint is changed by ``most_rad`` at most, or, if the error of its
+        angle (`angle_errors`) is larger, by as much as this error; what that cannot correct
+        remains.
         """
         problem = PoseProblem(self, wanted, warming)
         budget = problem.budget
@@ -287,8 +291,9 @@ class Compensator:
     def _way_back(self, reported: FloatArray, warming: FloatArray) -> FloatArray:
         """Nominal robot's angles minus reported angles, rad or m, (n, k), for the same tool pose.
 
-        ``warming``: of the arm, K, (n,). No joint is changed by more than ``most_rad``, or its own
-        error if that is larger.
+        ``warming``: temperature above the reference, K, (n,). A joint is changed by
+        ``most_rad`` at most, or, if its offset and terms together are larger, by as much as
+        these.
         """
         added = self.model.added_angles(self.model.drivers(reported, warming))
         added /= self.model.chain.per_radian
@@ -302,12 +307,13 @@ class Compensator:
         bounds: tuple[FloatArray, FloatArray],
         start: FloatArray,
     ) -> FloatArray:
-        """Nominal robot's minus reported angles for the same tool pose, within bounds, (n, k).
+        """Nominal robot's angles minus reported ones, rad or m, (n, k), within bounds.
 
-        rad or m. If no pose within the bounds is the same, the nearest one. ``reported``:
-        joint angles, rad, (n, k); ``warming``: temperature above the reference, K, (n,);
-        ``bounds``: least and largest difference, in rad or `SerialChain.per_radian`, (n, k)
-        each; ``start``: initial difference within the bounds, in that unit, (n, k).
+        With it the nominal robot's tool pose is that of the arm at the reported angles, or, if
+        the bounds do not allow this, the nearest. ``reported``: joint angles, rad or m, (n,
+        k); ``warming``: temperature above the reference, K, (n,); ``bounds``: least and
+        largest difference, in rad or `SerialChain.per_radian`, (n, k) each; ``start``: initial
+        difference within the bounds, in that unit, (n, k).
         """
         model, unit, weights = self.model, self.model.chain.per_radian, self.weights
         state = model._state(model.drivers(reported, warming))

@@ -148,9 +148,9 @@ class HeldByForm:
 def form_content(compensation: Compensation, form: Form, rng: np.random.Generator) -> HeldByForm:
     """Content of a correction that an export form can hold, fitted to the whole correction.
 
-    Both are compared at 400 configurations of the measured range, drawn by ``rng``, by the
-    position of the first marker in the first sensor; base and marker are fitted with the
-    content.
+    Fitted are the positions of the first marker in the first sensor at 400 configurations of
+    the measured range, drawn by ``rng``: the arm with this content to the arm with the whole
+    correction. Sensor pose and marker are fitted with the content.
     """
     model, content = compensation.model, compensation.content
     # A UR's kinematics file has no place for what carries the arm.
@@ -345,9 +345,11 @@ def exported(
 
 
 def _offsets(compensation: Compensation, held_content: HeldByForm) -> ZeroOffsets:
-    """Zero-offsets in a form, with the standard deviations of the whole correction and checks.
+    """Zero-offsets of a form's content, with the standard deviations of the whole correction.
 
-    The checks are the correction's notes 'CHECK FIRST', and the accuracy option that was on.
+    If the file has the expected error of lengths and tilts, the standard deviations contain
+    it. The warnings of the result are the notes 'CHECK FIRST' of the correction, and a
+    sentence if the maker's accuracy option was on.
     """
     content, model = compensation.content, compensation.model
     was = content.state.get('accuracy_option', '')
@@ -374,7 +376,11 @@ def _urdf(
     held_content: HeldByForm,
     notes: Sequence[str],
 ) -> str:
-    """Text of the nominal URDF with the offsets and geometry of a form's content."""
+    """Text of the nominal URDF with the offsets and geometry of a form's content.
+
+    ``offsets``: those that are applied; ``held_content``: has the geometry; ``notes``:
+    comments in the file, a line each.
+    """
     return calibrated_urdf(
         compensation.content.robot.urdf,
         offsets.chain,
@@ -395,8 +401,9 @@ def _ur_yaml(
     """Text of a UR's kinematics file with the origins of the corrected robot model.
 
     Joints that slide are left out. ``path``, ``text``: the arm's own file, which is not
-    changed. Raises InputError if it is no such file, or its origins are off those of the
-    measured robot by over 1e-6 m or rad.
+    changed; ``notes``: comments in the new text, a line each; other arguments as of `_urdf`.
+    Raises InputError if it is no such file, or its origins are off those of the measured robot
+    by over 1e-6 m or rad.
     """
     try:
         content = load_yaml(text)
@@ -527,7 +534,7 @@ def _number(text: str, path: Path, joint: str) -> float:
 
 
 def _json(compensation: Compensation, held_content: HeldByForm) -> str:
-    """Text of kinematics.json: robot, meaning of the tables, what is left out, and their rows."""
+    """Text of kinematics.json: robot, conventions, error left out, and rows of `tables`."""
     robot = compensation.content.robot
     content = {
         'format': KINEMATICS_FORMAT,
@@ -555,7 +562,11 @@ def _json(compensation: Compensation, held_content: HeldByForm) -> str:
 
 
 def _csv(held_content: HeldByForm) -> str:
-    """Text of kinematics.csv: a header, and a row for each number of `tables`."""
+    """Text of kinematics.csv: a header line, and a line for each `Row` of `tables`.
+
+    Columns are the fields of a row: table, part, parameter, unit, nominal value and correction
+    of one Denavit-Hartenberg or screw parameter. ``held_content``: has the corrected arm.
+    """
     text = io.StringIO()
     writer = csv_writer(text, lineterminator='\n')
     rows = [asdict(row) for row in tables(held_content.model)]

@@ -97,11 +97,11 @@ def drift(x: FloatArray, days: FloatArray) -> Drift:
 
 
 def _interval_of_batches(residuals: FloatArray, weights: FloatArray) -> float:
-    """Half of the 95 % interval of a drift's size, from the autocorrelation of its residuals (T,).
+    """Half of the 95 % interval of a drift's size, m, with autocorrelated residuals (T,).
 
-    Means of consecutive residuals, of a sixth of the series at most: if days resemble one
-    another, they differ by more than their scatter predicts. ``weights``: (T,), the size is
-    their sum with the results. 0 for fewer than six results.
+    Batch means: residuals are averaged in batches of consecutive results, so that slow changes
+    widen the interval. ``weights``: (T,), factors with which the results are summed to the
+    size. 0 for fewer than six results.
     """
     T = len(residuals)
     size = T // BATCHES

@@ -118,7 +118,11 @@ def exports(
 
 
 def written_notes(offsets: ZeroOffsets, remarks: Sequence[str] = ()) -> list[str]:
-    """Lines for the user of a file: remarks, names of the pad, checks, and joints left out."""
+    """Comment lines for an exported file: remarks, warnings of the result, joints left out.
+
+    If the robot's pad counts joints otherwise than the URDF, a line tells this with the
+    formulas.
+    """
     words = [] if offsets.controller is None else pad_in_words(offsets.controller)
     return [
         *remarks,
@@ -222,9 +226,10 @@ def remaster_text(
 
 
 def _plain_rows(steps: Sequence[MasteringStep]) -> list[str]:
-    """Lines of the table of steps if the pad has the URDF's names and units and all are set to 0.
+    """Lines of the table of mastering steps for a pad that counts the joints as the URDF does.
 
-    Joints that turn in degrees first, then prismatic ones in mm.
+    ``steps``: all `MasteringStep.is_plain`. Joints that turn, in degrees, come first, then
+    prismatic ones, in mm.
     """
     rows = []
     for unit in ('deg', 'mm'):
@@ -413,7 +418,8 @@ def parsed_xml(text: str) -> ElementTree.Element:
 def xml_text(before: str, root: ElementTree.Element, notes: Sequence[str]) -> str:
     """Text of a changed description, with notes as comments in it and the prolog of the original.
 
-    ``root`` is changed: the comments become its first children.
+    ``before``: original text; ``root``: root element of the changed description, in which the
+    comments become the first children; ``notes``: a comment each.
     """
     for text in reversed(notes):
         # Two hyphens would end the comment.

@@ -344,7 +344,10 @@ def _taken_at(driver: Driver) -> Literal['reported', 'with_offset']:
 
 
 def _knots_key(driver: Driver, joint: int, chain: SerialChain) -> str:
-    """Key of a spline's knots: 'knots_rad' or 'knots_m' for angles, else 'knots'."""
+    """Key of a spline's knots: 'knots_rad' or 'knots_m' for angles, else 'knots'.
+
+    ``joint``: index from 0 of the joint that drives; ``chain``: gives its unit.
+    """
     return f'knots_{chain.units[joint]}' if driver == 'angle' else 'knots'
 
 

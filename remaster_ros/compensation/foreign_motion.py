@@ -204,8 +204,8 @@ class TrueAngles:
 
         The correction is computed at most every `EVERY_S` while the arm moves, and after it
         stands until it no longer changes; its rate of change is `ADDED_RAD_S` at most. Between
-        computations it is off by the way in that time times the slope of the correction.
-        ``temperature_c``: of the arm, None for the mean of the measurements.
+        computations the last one is used, so that the angles are off by what it has changed
+        since. ``temperature_c``: of the arm, None for the mean of the measurements.
         """
         if self._at is None:
             self.added, self._is_known = self._compensator.true(q, temperature_c) - q, True
@@ -249,12 +249,13 @@ def corrected_for_controller(
     """Trajectory to send to the controller for a planner's trajectory.
 
     If the arm stands, points are added and time is stretched as
-    `trajectories.corrected_trajectory` does. If it moves, only the points are corrected: how the
-    controller gets to the first of them is its own. ``wanted``: the trajectory, which begins at
-    once; without points: hold the arm; ``arm``: its reports; ``gate``: checks the trajectory that
-    is sent; ``correction``: may be one that corrects nothing; ``tolerance_m``: largest distance of
-    the tool from the wanted path between points, m; ``temperature_c``: of the arm; ``believed_q``:
-    position of the arm that the planner was given, rad, (k,); None for that of `Compensator.true`.
+    `trajectories.corrected_trajectory` does. If it moves, only the points are corrected; the
+    controller decides how it gets to the first of them. ``wanted``: the trajectory, which
+    begins at once; without points: hold the arm; ``arm``: its reports; ``gate``: checks the
+    trajectory that is sent; ``correction``: may be one that corrects nothing; ``tolerance_m``:
+    largest distance of the tool from the wanted path between points, m; ``temperature_c``: of
+    the arm; ``believed_q``: position of the arm that the planner was given, rad, (k,); None
+    for that of `Compensator.true`.
 
     Raises InputError, in one line, if the trajectory is refused.
     """
@@ -294,7 +295,9 @@ def _passed(
 ) -> SentTrajectory:
     """Return the trajectory to send, with the arm's position, velocity and rest at present.
 
-    ``end``: command at its end and wanted angles there, rad, (k,); None if the arm is held.
+    ``admitted``: waypoints that the gate admitted; ``end_s``: time of the last one from the
+    start, s; ``notes``: remarks for a person; ``end``: command at the end and wanted angles
+    there, rad, (k,) each; None if the arm is held.
     """
     return SentTrajectory(admitted, end_s, arm.q, arm.velocity, arm.stands, tuple(notes), end)
 

@@ -131,9 +131,10 @@ class CorrectionInUse:
 
     @cached_property
     def _bends(self) -> FloatArray:
-        """Angle between each joint's frame in the full model and in `true_arm`, rad, (2000, k).
+        """Rotation that `true_arm` lacks at each joint, rad, (2000, k), without sign.
 
-        Of the rotation relative to the joint before, at each sampled configuration.
+        Angle between the joint's frame in the full model and in `true_arm`, both relative to
+        the frame of the joint before, at each sampled configuration.
         """
         frames = self.compensator.model.state(self._sampled).frames
         rigid = self.true_arm.frames(self._sampled)
@@ -146,9 +147,11 @@ class CorrectionInUse:
     def joint_angle_bound(self, before_rad: float) -> float:
         """Upper bound on the error of a joint's angle in `true_arm`, rad.
 
-        Clearances grow by it times the root of the sum of the squares of the levers: it bounds the
-        root of the sum of the squares of all joints' errors, so that no bodies come nearer (Cauchy
-        and Schwarz). Rotations across an axis count by the levers of other joints.
+        It bounds the root of the sum of the squares of all joints' errors, so that a body may
+        be off by this bound times the root of the sum of the squares of the joints' lever arms
+        (Cauchy and Schwarz): clearances for collision checks grow by that. Rotations by terms
+        and compliance, which `true_arm` lacks, are contained, also those across the joints'
+        axes.
 
         Parameters
         ----------

@@ -41,8 +41,9 @@ def errors_with_correction(model: ArmModel, measurements: Measurements) -> Float
     """Errors (measured minus modelled) of all rows if the arm were corrected, m, (n, 3).
 
     In the sensors' frames, with the model of a compensation.json. They contain the errors that
-    a command leaves near singularities; nothing is fitted. ``measurements`` have the model's
-    sensors and markers by their indices; rows without a temperature have the reference's.
+    a command leaves near singularities; nothing is fitted. ``measurements``: their indices of
+    sensors and markers count those of the model, in its order; rows without a temperature
+    count as at the reference temperature.
     """
     m = measurements
     known = np.isfinite(m.temperature_c)
@@ -59,11 +60,11 @@ def errors_with_correction(model: ArmModel, measurements: Measurements) -> Float
 
 
 def without_errors_of_measuring(fit: FitResult, parameters: slice | FloatArray) -> FloatArray:
-    """Measured positions of all rows less the effect of some causes of a fit, m, (n, 3).
+    """Measured positions of all rows without the effect of some parameters of a fit, m, (n, 3).
 
-    ``parameters``: slice or mask of the causes' parameters (those beyond offsets,
-    registrations and markers), of errors of the measurement. The measured positions themselves
-    if there are none.
+    ``parameters``: slice or mask among the fit's further parameters (those after offsets,
+    registrations and markers), meant for those of sensor errors. The measured positions
+    themselves are returned if these parameters are all 0 or there are none.
     """
     measured = fit.session.measurements.position
     model, after = fit.predictive.model, fit.predictive.after

@@ -157,8 +157,9 @@ def mastering(
 def _places(chain: SerialChain, offsets: FloatArray) -> FloatArray:
     """True joint positions at which zeros are set, rad or m, (k,): 0, else mid-range.
 
-    Mid-range, rounded to 10 degrees or 10 mm, if 0 plus or minus the joint's offset, (k,), is
-    beyond its limits; those of joints that turn are cut to ±180 degrees.
+    0 if plus and minus the joint's offset, (k,), are both within its limits; else the middle
+    of the limits, rounded to 10 degrees or 10 mm. Limits of joints that turn are first cut to
+    ±180 degrees.
     """
     turn = np.where(chain.slides, np.inf, np.pi)
     lower, upper = np.maximum(chain.lower, -turn), np.minimum(chain.upper, turn)

@@ -115,11 +115,12 @@ def arm_of_offsets(
 ) -> CorrectedArm:
     """Arm with the zero-offsets of a fit; offsets that are not identifiable are 0.
 
-    Registrations (sensor poses) and markers are the most likely ones with these offsets: if
-    only a prior separates an offset from a position of the marker, leaving out the one moves
-    the other. If ``geometry`` is given (see `arm_of_geometry`), the expected error is that
-    against the arm with all lengths and tilts, since no arm is exactly its drawing.
-    ``widening``: factor on the standard deviations; ``notes``: added to those of the arm.
+    Registrations (sensor poses) and markers are the most likely ones given these offsets: with
+    an offset set to 0, those that are correlated with it change. ``widening``: factor on the
+    standard deviations; ``notes``: added to those of the arm; ``geometry``: arm with all link
+    lengths and axis tilts as well (`arm_of_geometry`), against which the expected error is
+    computed, since real lengths and axes are never exactly nominal; None: the expected error
+    is the posterior's.
     """
     described = _described(fit, [], np.zeros(0), None, widening)
     model = described.model
@@ -158,11 +159,11 @@ def arm_of_geometry(
     geometry: GeometryModel,
     measurements: Measurements,
 ) -> CorrectedArm:
-    """Arm with all lengths and tilts of a fit, and the zero-offsets that belong to them.
+    """Arm with all link lengths and axis tilts of a fit, and the zero-offsets fitted with them.
 
-    ``geometry``: their model, fitted at its mode, whose covariance the arm has;
-    ``measurements``: those that were fitted, with the indices of the sensors and markers that
-    occur in them.
+    ``geometry``: model of the lengths and tilts; the arm has the mode and the covariance of
+    its posterior; ``measurements``: those that were fitted; their indices count the sensors
+    and markers that occur in them.
     """
     mode = geometry.mode
     posterior = mode.linearisation.posterior
@@ -202,11 +203,12 @@ def arm_of_effects(
 
 
 def mounts_of(fit: FitResult, model: ArmModel) -> dict[str, Mount]:
-    """Marker and rotation of each sensor on the tool, by its name, with the arm of a correction.
+    """Marker and rotation of each sensor on the tool, by its name; {} without such sensors.
 
-    The rotations of the fit belong to its zero-offsets. A correction leaves out those that are
-    not identifiable: with it the rotation R_T_C is the mean that the fitted rows show. A
-    rotation is unset if the fit has none of that sensor; {} without sensors on the tool.
+    The rotation R_T_C is the mean over the fitted rows, computed with ``model``, the arm of
+    the correction: the rotation of the fit belongs to all its zero-offsets, of which a
+    correction lacks those that are not identifiable. Its standard deviations are the fit's.
+    The rotation is unset if the fit has none of that sensor.
     """
     session, found, m = fit.session, fit.orientations, fit.measurements
     left_out = [observation for observation, _ in fit.left_out]
@@ -294,12 +296,13 @@ def _described(
 def _as_predicted(
     model: ArmModel, fit: FitResult, problem: Problem, without: Sequence[slice]
 ) -> ArmModel:
-    """Arm that predicts the fitted rows as the fit does; parameters in ``without`` count as 0.
+    """Arm whose parameters are adapted so that it predicts the fitted rows as the fit does.
 
-    The fit has lengths, tilts and the like to first order, about the zero-offsets that were
-    found without them; this model has them exactly. The difference is removed within the
-    posterior's uncertainty: a step C J' d / σ² with its covariance C. If the data determine
-    everything, C is (J' J / σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
+    ``without``: slices of the fit's further parameters that count as 0. The fit is linear in
+    lengths, tilts and other effects, about the zero-offsets found without effects; the arm is
+    not. The difference d of the predictions is removed within the posterior's uncertainty: a
+    step C J' d / σ² with its covariance C. If the data determine everything, C is (J' J /
+    σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
     """
     z = fit.predictive.after.copy()
     for parameters in without:
@@ -493,8 +496,8 @@ def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
 def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, FloatArray]]:
     """Yield functions of a candidate, each with the matrix from its parameters to coefficients.
 
-    Nothing for a driver or form that no correction has. ``joint``: index from 0, for a driver
-    that names none.
+    Nothing for a driver or form that no correction has. ``joint``: index from 0 of the joint
+    that drives if the name of the candidate's driver contains no joint.
     """
     if candidate.happened:
         # The arm is as it was after what happened.
@@ -526,6 +529,7 @@ def _functions(candidate: Candidate, joint: int) -> Iterator[tuple[Function, Flo
 def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatArray]:
     """Function of a curve as splines, and the matrix from its free heights to all coefficients.
 
+    Free are the heights of all splines but one, which follows from the zero mean of the curve.
     ``joint``: index from 0 of the joint whose angle or torque drives; -1 for other drivers.
     """
     heights = curve.heights
@@ -541,10 +545,11 @@ def _splines(curve: Curve, driver: Driver, joint: int) -> tuple[Function, FloatA
 def _not_corrected(
     candidates: Sequence[tuple[Candidate, slice]], theta: FloatArray, data: Residuals
 ) -> Iterator[NotCorrected]:
-    """Yield the effects that are not corrected; candidates of one name, joints and reason are one.
+    """Yield the effects that are not corrected, each with its size, the reason and the remedy.
 
-    Effects that round to 0.000 mm RMS are left out. ``candidates``: with their slices of
-    ``theta``, their parameters; ``data``: residuals in which they were sought.
+    Candidates with the same name, joints and reason are summed to one effect; effects that
+    round to 0.000 mm RMS are left out. ``candidates``: with their slices of ``theta``, their
+    parameters; ``data``: residuals in which they were sought.
     """
     by_effect: dict[tuple[str, tuple[int, ...], str], FloatArray] = {}
     remedies = {}

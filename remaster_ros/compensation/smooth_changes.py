@@ -166,8 +166,9 @@ def smooth_changes(
 def accelerations(rows: FloatArray, state: FloatArray) -> FloatArray:
     """Accelerations of cubics at both ends of each interval, (n - 1, 2, k).
 
-    ``rows``: weights of (value, speed) before and after each interval, (n - 1, 2, 4);
-    ``state``: values and speeds, (n, 2, k).
+    ``state``: values and speeds at the n times, (n, 2, k); ``rows``: for the acceleration at
+    each end of an interval, factors of value and speed at its start, then at its end, (n - 1,
+    2, 4).
     """
     both = np.concatenate((state[:-1], state[1:]), axis=1)
     return np.asarray(np.einsum('nej,njk->nek', rows, both))
@@ -182,8 +183,8 @@ def _limit_shares(
     """Largest ratio of acceleration or speed to its limit in each interval, (n - 1,).
 
     ``speed``, (n, k), and ``acceleration``, (n - 1, 2, k): of the change, to which those of
-    the path, ``wanted``, are added. If the path itself exceeds a limit of acceleration, the
-    limit is the path's plus a share `ADDED` of it.
+    the path, ``wanted``, are added. The limit of an acceleration is at least 1 + `ADDED` times
+    that of the path itself, which may exceed ``limits``.
     """
     allowed = np.maximum(limits.acceleration, (1.0 + ADDED) * np.abs(wanted[0]))
     accelerated = np.max(np.abs(acceleration + wanted[0]) / allowed, axis=(1, 2))
@@ -205,8 +206,10 @@ def _step(
 ) -> FloatArray:
     """Gauss–Newton step of changes and speeds, (n, 2, k); 0 where ``fixed``.
 
-    ``error, jacobian``: weighted, (n, 6) and (n, 6, k); ``rows``: as of `accelerations`; ``h``:
-    intervals, s; ``share``: of each time in the integral, s; ``weight, pull``: ρ and κ.
+    ``error, jacobian``: weighted, (n, 6) and (n, 6, k); ``state``: present changes and speeds,
+    (n, 2, k); ``rows``: as of `accelerations`; ``h``: intervals, s; ``share``: duration that
+    each time counts for, s; ``weight``: of squared accelerations, (n - 1, k); ``pull``: of the
+    squared difference from ``angle_change``, (n,).
     """
     n, _, k = state.shape
     turned = jacobian.swapaxes(1, 2)

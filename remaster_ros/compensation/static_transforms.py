@@ -76,7 +76,8 @@ def static_transforms(
     ------
     InputError
         No such sensor, a name that tf2 does not accept or that two frames have, a sensor on the
-        tool whose rotation is unknown, or a file of a version that does not tell these.
+        tool whose rotation is unknown, or a file of an earlier version, in which it is not stated
+        which sensors are on the tool.
     """
     content = compensation.content
     for sensor in frames:

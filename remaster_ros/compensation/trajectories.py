@@ -248,8 +248,8 @@ def _checked(
 def _sampling_times(compensator: Compensator, wanted: DrawnPath) -> FloatArray:
     """Times, s, ascending, at which the correction is computed, with those of the path's points.
 
-    Apart by at most 0.5 rad of a joint's way, or an eighth of the shortest wave of a term; but
-    not by less than 1 ms.
+    Between two of them no joint moves further than 0.5 rad, or an eighth of the period of the
+    joint term with the highest order if that is less; but no times closer than 1 ms are added.
     """
     orders = [term.function.order for term in compensator.model.joint_terms]
     step = min(LONGEST_STEP_RAD, 2.0 * np.pi / (POINTS_OF_WAVE * max([1, *orders])))
@@ -273,12 +273,12 @@ def _allowed(
     speed_limits: FloatArray,
     acceleration_limits: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Largest speeds and accelerations of a corrected path before it is slowed down, (k,) each.
+    """Largest speeds and accelerations of a corrected path before time is stretched, (k,) each.
 
-    ``wanted``: largest of the wanted path, (k,) each. They allow for slowing down by `SLOWER`,
-    in addition to the slowing down that the wanted path itself requires. Without limits of
-    acceleration: the path's own, plus the largest of all joints or, if more, the square of its
-    largest speed.
+    ``wanted``: largest of the wanted path, (k,) each. They are the limits, raised so far that
+    the path then has to be slowed down by `SLOWER` more than the wanted path itself. Without
+    limits of acceleration, or for a path of lines: the path's own, plus the largest of all
+    joints or, if more, the square of the largest speed.
     """
     speed, acceleration = wanted
     slower = max(1.0, float(np.max(speed / speed_limits)))
@@ -367,10 +367,12 @@ def _deviation_between(
     knots: IntArray,
     temperature_c: float | None,
 ) -> FloatArray:
-    """Deviation of the tool's position at places within each interval, beyond that at the knots.
+    """Deviation of the tool from the wanted path within each interval, m, (n - 1, times).
 
-    m, (n - 1, places). What remains at two knots is expected to change linearly between them,
-    and taken off. ``knots``: indices of the times of ``sent``.
+    At some times of the interval; the last is the end of the interval. From the deviation its
+    linear interpolation between the knots is subtracted: an error that the correction leaves
+    there is not counted. ``sent``: path that is sent, with n points; ``knots``: indices of
+    those at which changes were computed.
     """
     times, share = sent.t, COMPARED[sent.v is not None]
     inside = times[:-1, None] + np.diff(times)[:, None] * np.concatenate((share, [1.0]))

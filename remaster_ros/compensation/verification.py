@@ -318,9 +318,10 @@ def _absolute(side: _ProjectedRows) -> tuple[Estimate, list[Estimate], list[Floa
 def _single_joint_alternatives(
     side: _ProjectedRows, best: Verdict, sigma: float, evidence: float
 ) -> list[FloatArray]:
-    """Projected displacements, (d,) each, by one joint in another state, if it is not excluded.
+    """Projected displacements, (d,) each, if one joint is in another state than the rest.
 
-    Only joints whose state the rows could tell are considered. ``best``: state of the others;
+    Listed are alternatives that explain the rows better than ``best`` itself; only those that
+    the rows could distinguish from it are considered. ``best``: state of the correction;
     ``sigma``: noise of a reading per axis, m; ``evidence``: log evidence of ``best``.
     """
     unsure = side.projected(side.unsure(side.commands[best]))

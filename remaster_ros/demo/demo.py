@@ -275,7 +275,11 @@ class Demo:
         return file
 
     def _print_applied(self, file: Path) -> None:
-        """Print the verdict of `remaster verify` on the corrected poses, and the true errors."""
+        """Print the verdict of `remaster verify` on the corrected poses, and the true errors.
+
+        ``file``: compensation.json by which the bridge corrected. The true errors are the mean
+        distances of the tool from where it was wanted, mm, with and without the correction.
+        """
         done = self._run('verify', str(self.corrected), '--compensation', str(file))
         self.console.print((done.stdout or done.stderr).strip())
         before, after = true_errors(
@@ -589,10 +593,10 @@ class Demo:
 
 
 def output_folder(path: Path) -> Path:
-    """Prepare the folder that the demo writes, with its folder log; return it.
+    """Make the output folder of the demo, with its subfolder log, and return it.
 
-    It is made, or empty, or that of a demo that was interrupted: with an unfinished session,
-    or before its session began, with only logs. Raises InputError if the folder holds other
+    A folder that exists may be empty, or that of an interrupted demo: with an unfinished
+    session, or, before the session began, with only logs. Raises InputError if it holds other
     files or cannot be written.
     """
     session = path / 'session'

@@ -118,9 +118,9 @@ def true_errors(
 ) -> tuple[float, float]:
     """Return the mean true error of the tool without and with a correction, mm.
 
-    At the configurations of a session that was measured with the correction on. True positions
-    of the tool are compared with those of the nominal arm, with base and marker fitted for
-    each of the two.
+    At the configurations of a session that was measured with the correction on: the distance
+    of the tool's true position from that of the nominal arm at the wanted joint angles. Base
+    and marker are fitted separately without and with the correction.
     """
     m = session.measurements
     assert m.wanted is not None

@@ -158,7 +158,10 @@ class Confirmation(Struct, frozen=True):
 
     @property
     def carries_over(self) -> bool:
-        """Whether more than half of the possible gain carries over; False if that is unknown."""
+        """Whether causes as found here reach over half of the gain possible in the other session.
+
+        The possible gain is that of the causes fitted to the other session. False if unknown.
+        """
         return self.carried_over is not None and self.carried_over > 0.5
 
 
@@ -230,11 +233,12 @@ def confirm(discovery: Discovery, session: Session, rng: np.random.Generator) ->
 
 
 def share_of_gain(before: float, frozen: float, refitted: float) -> float | None:
-    """Return the gain in mean square by causes as found, as a share of the possible gain.
+    """Return the share of the possible reduction of the squared error that causes as found reach.
 
-    ``before``, ``frozen``, ``refitted``: RMS errors of a session without causes, with them as
-    found in the other session, and with them fitted to this session, m. At most 1; negative if
-    ``frozen`` is the largest. None if the possible gain is next to nothing (`LEAST_GAIN`).
+    ``before``, ``frozen``, ``refitted``: RMS errors of a session, m: without causes, with the
+    causes as found in another session, and with the causes fitted to this one. At most 1;
+    negative if ``frozen`` is the largest. None if hardly any reduction is possible
+    (`LEAST_GAIN`).
     """
     could = before**2 - min(refitted, frozen) ** 2
     if could < LEAST_GAIN * before**2:
@@ -249,12 +253,12 @@ def _with(choices: Choices, index: int, choice: Choice) -> Choices:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """Normal equations of a session for its natural parameters and the arm's errors.
+    """Normal equations of a session for its natural parameters and the parameters of arm errors.
 
-    Natural parameters are zero-offsets, registrations and markers; the arm's errors have m
-    parameters. Both ``products`` and ``plain`` are X'WX of the columns of these, of the arm's
-    errors, and of the residuals; errors of the measurement are marginalised in ``products``
-    and ignored in ``plain``.
+    Natural parameters are zero-offsets, registrations and markers. Both ``products`` and
+    ``plain`` are X'WX, X being the columns of the natural parameters, then those of the m
+    parameters of the arm's errors, and last the residuals. Errors of the measurement are
+    marginalised in ``products`` and ignored in ``plain``.
     """
 
     data: Residuals
@@ -269,10 +273,11 @@ class _Measured:
         candidates: Sequence[Candidate],
         nuisance: Sequence[_Weighted],
     ) -> _Measured:
-        """Assemble the equations of the rows of ``data``.
+        """Assemble the equations of the rows that ``data`` works on.
 
-        ``candidates``: of the arm's errors, with parameters of their own; ``nuisance``: of
-        errors of the measurement, marginalised in `products`.
+        ``candidates``: errors of the arm, whose parameters become unknowns of the equations;
+        ``nuisance``: errors of the measurement, each with its prior precision, marginalised in
+        `products`.
         """
         natural = data.full_jacobian[data.rows.source]
         further = data.columns([candidate for candidate, _ in nuisance])
@@ -293,9 +298,11 @@ class _Measured:
         return int(self.data.full_jacobian.shape[2])
 
     def apart(self, precision: FloatArray) -> tuple[FloatArray, float]:
-        """Return `products` with the arm's errors marginalised, and the log evidence lost by that.
+        """Return `products` with the arm's errors marginalised, and the Occam term of that.
 
-        ``precision``: of the prior on their parameters, (m, m).
+        The term, half the log determinant of posterior over prior precision, has to be
+        subtracted from the log evidence. ``precision``: of the prior on the parameters of the
+        arm's errors, (m, m).
         """
         where = slice(self.size, self.size + len(precision))
         across = self.products[where]
@@ -440,10 +447,11 @@ class _Both:
 
     @cached_property
     def _of_the_other(self) -> tuple[FloatArray, float]:
-        """Products of the other session's equations, and the log evidence lost to its own errors.
+        """Products of the other session's equations, and a term to subtract from the log evidence.
 
-        If `share` is above 0, errors of the arm with that share of the prior variance are
-        marginalised; else the products are as they are, and 0 is lost.
+        If `share` is above 0, the other session has arm errors of its own, with that share of the
+        prior variance: they are marginalised, see `_Measured.apart`. If it is 0, these are its
+        `products` unchanged, and 0.
         """
         if self.share == 0.0:
             return self.there.products, 0.0
@@ -479,11 +487,11 @@ class _Both:
     ) -> ConfirmedCause:
         """Compare a cause in both sessions: its evidence, parameters and RMS errors.
 
-        ``best``: choices of all zero-offsets and causes, which the evidence keeps for the
-        others; ``index``: of the cause in `groups`; ``rows``: mask of rows of the other
-        session, to which its RMS errors are restricted (see `error`), with all other causes
-        fitted to that session. A cause without candidates (a step) has 0 rows, no errors and
-        the answer 'open'.
+        ``best``: choices of all zero-offsets and causes; only that of this cause is varied for
+        the evidence; ``index``: of the cause in `groups`; ``rows``: mask of the other session's
+        rows in which its RMS errors are taken, all other causes being fitted to that session
+        (see `error`). A cause without candidates (a step) has 0 rows, no errors and the answer
+        'open'.
         """
         group = self.groups[index]
         if not group:
@@ -506,18 +514,19 @@ class _Both:
 
     @cached_property
     def alone(self) -> _Fitted:
-        """Fit of both sessions with every zero-offset and cause of its own in each.
+        """Fit of both sessions in which each has its own value of every zero-offset and cause.
 
-        Candidates that are in no cause remain shared.
+        Candidates that belong to no cause have one value for both.
         """
         every: Choices = (CHOICES[1],) * (self.joints + len(self.groups))
         return self.fitted(every)
 
     @cached_property
     def _spread(self) -> FloatArray:
-        """Covariance of the m parameters of `candidates` by this session (`here`), (m, m).
+        """Covariance of the m parameters of `candidates` for this session in `alone`, (m, m).
 
-        With their prior. Candidates that make no cause are fitted to both sessions at once.
+        Includes their prior. Candidates that belong to no cause have one value for both sessions,
+        so the other session counts for these, too.
         """
         return self.alone.covariance(self.here.size + np.arange(len(self.precision)))
 
@@ -539,13 +548,14 @@ class _Both:
         rows: BoolArray | None = None,
         joint_offsets: FloatArray | None = None,
     ) -> float:
-        """Return the RMS 3-D error of the other session with some candidates fixed, m.
+        """Return the RMS 3-D error of the other session with some parameters fixed, m.
 
-        ``absent``, ``frozen``: indices of candidates whose parameters are 0, or as found in
-        this session; ``joint_offsets``: zero-offsets to keep, rad or m, (k,). Parameters of
-        these candidates that this session hardly determines are fitted to the other session,
-        as is all else. The error is of its validation rows, or of the fitted rows if it has
-        none; only of those in ``rows``, (all rows,), unless that leaves none.
+        ``absent``: indices of candidates whose parameters are fixed at 0; ``frozen``: of those
+        fixed at the values found in this session, except parameters that this session hardly
+        determines; ``joint_offsets``: zero-offsets to fix, rad or m, (k,), or None. All other
+        parameters are fitted to the other session. The error is over its validation rows, or its
+        fitted rows if it has none; of these only the ones in the mask ``rows``, (all rows,),
+        unless that leaves none.
         """
         there, k, size = self.there, self.joints, self.there.size
         parameters = np.full(size + len(self.precision), np.nan)
@@ -576,10 +586,11 @@ class _Both:
         return [joint for joint, choice in enumerate(best[: self.joints]) if choice == 'own']
 
     def offsets(self, best: Choices, joint: int) -> tuple[FloatArray, FloatArray] | None:
-        """Return a joint's zero-offset in this and the other session, and their covariance.
+        """Return a joint's zero-offsets in this and the other session, and their covariance.
 
-        (2,), rad or m, and (2, 2). ``best``: choices, kept for all else; ``joint``: from 0.
-        None if one of the sessions does not determine the offset.
+        (2,), rad or m, and (2, 2), from a fit in which only this joint's choice is 'own'
+        instead of that in ``best``. ``joint``: from 0. None if one of the sessions does not
+        determine the offset.
         """
         fit = self.fitted(_with(best, joint, 'own'))
         where = np.array([joint, fit.there[joint]])
@@ -593,8 +604,8 @@ class _Both:
     def offsets_side_by_side(self, discovery: Discovery, best: Choices) -> tuple[Compared, ...]:
         """Compare the zero-offset of each joint that both sessions determine, in degrees or mm.
 
-        ``best``: choices, kept for all else. Joints that one session does not determine are
-        left out.
+        ``best``: choices of all zero-offsets and causes, changed only for the joint compared.
+        Joints that one session does not determine are left out.
         """
         rows: list[Compared] = []
         chain = discovery.fit.chain
@@ -673,8 +684,9 @@ def answer_of(evidence: Mapping[Choice, float]) -> Answer:
 def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, list[_Weighted]]:
     """Return a session's noise, and its errors of the measurement with their prior precisions.
 
-    ``causes``: candidates to fit first. [] for the errors unless all kinds of errors together
-    explain the session clearly better.
+    Both are of a fit of ``causes`` and of all kinds of errors as random effects. If the latter do
+    not explain the session clearly better, the noise is of ``causes`` alone, and [] is returned
+    for the errors.
     """
     candidates = [
         candidate
@@ -700,10 +712,10 @@ def _by_itself(data: Residuals, causes: Sequence[Candidate]) -> tuple[Noise, lis
 
 
 def _natural(size: int, per_radian: FloatArray | None = None) -> FloatArray:
-    """Return the prior precision of a session's natural parameters, (size,).
+    """Return the diagonal prior precision of a session's natural parameters, (size,).
 
     1 each: registrations and markers are known to a metre or radian. With ``per_radian``, (k,),
-    the first k are zero-offsets, with a standard deviation of `STEP_STD` times that.
+    the first k are zero-offsets of standard deviation `STEP_STD` times ``per_radian``, rad or m.
     """
     found = np.ones(size)
     if per_radian is not None:
@@ -724,8 +736,9 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
 def _prior(discovery: Discovery, candidate: Candidate, wide: Candidate) -> FloatArray:
     """Return the prior precision of the parameters of a candidate of the arm's errors, (m, m).
 
-    ``wide``: the candidate `widened`. Of a free form or a member of no cause: that of the
-    discovery's solution; else of a standard deviation as large as the parameters found.
+    As in the discovery's solution for a free form (spline), or if the candidate belongs to no
+    cause. Else the prior standard deviation is as large as the RMS of the parameters found.
+    ``wide``: the candidate as returned by `widened`.
     """
     solution, fit = discovery.solution, discovery.fit
     is_cause = any(candidate in group for group in discovery.groups)
@@ -857,7 +870,8 @@ def _readings(session: Session) -> set[bytes]:
 def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
     """Return sentences on a confirmation: whether the zero-offsets are the same, then each cause.
 
-    Only `why` if nothing can be compared; a single sentence if the offsets are another arm's.
+    Only `Confirmation.why` if nothing can be compared. A single sentence if the zero-offsets
+    differ and nothing is confirmed, so that the other session is probably of another arm.
     """
     found = confirmation
     if found.why:
@@ -913,7 +927,11 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
 
 
 def _said(cause: ConfirmedCause) -> str:
-    """Return the other session's answer on a cause as text, to follow its title."""
+    """Return the answer on a cause, and its errors in the other session, as text.
+
+    To follow the cause's title: begins with '. ' or ': '. A cause that happened once is said to
+    be no matter of that session.
+    """
     evidence, without, frozen = cause.log_evidence, cause.rms_without_m, cause.rms_frozen_m
     if evidence is None or without is None or frozen is None:
         return ': it happened once, and is no matter of the other session.'

@@ -54,10 +54,10 @@ class Decision(Struct, frozen=True):
     def of(
         cls, cause: Named, look_alike: Named, answer: Answer, log_evidence: float | None = None
     ) -> Decision:
-        """Return the decision with its sigma and sentence.
+        """Return the decision on a cause and its look-alike, with significance and sentence.
 
-        ``log_evidence``: of the cause less that of its look-alike; None if the search now names
-        neither: sigma is 0 then.
+        ``answer``: the outcome; ``log_evidence``: of the cause less that of its look-alike. If
+        None, the significance is 0 and the sentence says that the search names neither.
         """
         if log_evidence is None:
             words = f'the search now names neither {cause} nor {look_alike}'
@@ -95,8 +95,9 @@ def decisions(found: Discovery, pairs: Sequence[tuple[Named, Named]]) -> tuple[D
 def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
     """Decide between a cause and a look-alike by log evidence.
 
-    'neither' if the search named none of the two, or none can be fitted; 'open' unless the odds
-    exceed twenty to one and the winner is among the causes named.
+    The answer is 'cause' or 'look_alike' if the odds exceed twenty to one and the search names
+    the winner, else 'open'. It is 'neither' if the search names none of the two, or if none can
+    be fitted.
     """
     # Named are causes that the search has found now; part of a solution may be located structure.
     named = [Named(effect.name, effect.joints) for effect in found.effects]
@@ -122,8 +123,9 @@ def _decision(found: Discovery, cause: Named, look_alike: Named) -> Decision:
 def _rest(found: Discovery, *causes: Named) -> tuple[Candidate, ...]:
     """Return the candidates of a discovery's model with some causes taken out.
 
-    All candidates of named causes that belong to none of ``causes``; and the background families
-    that have no member of such a name, and no parameter of any named cause.
+    These are the candidates of all other named causes, and of the background those families of
+    random effects that have no member with the name of one of ``causes`` and share no parameter
+    with a named cause.
     """
     named = [candidate for group in found.groups for candidate in group]
     kinds = {cause.name for cause in causes}
@@ -159,10 +161,11 @@ def _without(found: Discovery, *causes: Named) -> float:
 
 
 def _evidence(found: Discovery, cause: Named, other: Named) -> float | None:
-    """Return the log evidence with one cause and without another; None if it cannot be fitted.
+    """Return the log evidence of the model with ``cause`` and without ``other``.
 
-    The cause has its candidates in the model if these cover all its joints, else the best of
-    `_variants`. Fits with a sign that physics excludes do not count.
+    The cause has its candidates in the discovery's model if these cover all its joints, else
+    the best set of `_variants`. None if no set can be fitted with parameters of a sign that is
+    physically possible.
     """
     every, remaining = _candidates(found), _rest(found, cause, other)
     named = [candidate for group in found.groups for candidate in group]

@@ -144,9 +144,9 @@ class Discovery:
     def loads_geometry(self) -> bool:
         """Whether a robot model with all fitted lengths and tilts is worth loading.
 
-        False without `geometry`. True if it predicts held-out poses clearly better than the
-        drawing; if only by little, or without held-out rows, if a length or tilt is among the
-        causes.
+        It is if it predicts held-out poses clearly better than the drawing. If it predicts them
+        only slightly better, or if there are no held-out rows, it is worth it only if a length or
+        tilt is among the causes. False without `geometry`.
         """
         if self.geometry is None:
             return False
@@ -306,8 +306,8 @@ def _bare(data: Residuals) -> Solution:
 def _candidates(context: Context) -> tuple[list[Candidate], dict[str, str]]:
     """Return all candidate causes of a session, and the effects that it cannot show.
 
-    Changes in mid-session are among the former, effects judged by the fit itself (marker
-    offsets) are not. The latter: name -> reason.
+    The candidates include changes in mid-session, but no marker offsets, which are judged by
+    the fit itself. The effects that cannot be shown are given as name -> reason.
     """
     effects_tried = effects_of(context)
     untestable = {
@@ -333,8 +333,9 @@ def _searched(
 ) -> _Searched:
     """Walk over models of causes; twice if the best model changes which rows are gross errors.
 
-    ``found``: the fit; ``residuals``: its residuals; ``pool``: rows to search, gross or not;
-    ``candidates``: all causes to try; ``report``: called with the stage and the share done.
+    ``found``: the fit to be extended; ``residuals``: its residuals; ``pool``: indices of the rows
+    to search, gross errors among them; ``candidates``: all causes to try; ``report``: called with
+    the stage and the share done.
     """
     walking = partial(report, 'searching causes')
     walk = Walk(residuals, candidates, rng, walking, None)
@@ -474,8 +475,9 @@ def _to_search(
 ) -> tuple[Estimate, Residuals, IntArray]:
     """Return the fit to be extended by causes, its residuals, and the rows to search.
 
-    ``before``: fit of the offsets alone; fitted again with wide priors for markers that have
-    moved. ``rng``: draws the rows, indices in the session, if they are many.
+    The fit is ``before``, that of the offsets alone; if markers have moved, it is made again
+    with wide priors for these. The rows are indices in the session, drawn by ``rng`` if they
+    are many; gross errors are among them.
     """
     found, residuals = before, Residuals.of(before)
     bare = solve(residuals, ())
@@ -503,11 +505,12 @@ def _sampled(
     report: Progress,
     clock: Callable[[], float] | None,
 ) -> tuple[FitResult, tuple[Gain, Mapping[str, Any]], FloatArray]:
-    """Sample the first of some models, each with its share, and measure its gain.
+    """Sample the first of some models, and measure its gain on held-out rows.
 
     Returns the sampled fit, `gain_of` it, and the std of the zero-offsets if the arm is
-    exactly its drawing, rad, (k,). ``before``: fit of the offsets alone; ``found``: the fit
-    that ``models`` extend; ``named``: candidates of the causes.
+    exactly its drawing, rad or m, (k,). ``before``: fit of the offsets alone; ``found``: the
+    fit that ``models`` extend; ``models``: each with its posterior weight; the others than the
+    first widen the uncertainty; ``named``: candidates of the causes.
     """
     solution = models[0][0]
     unmodelled = Unmodelled.of(found, data, solution)
@@ -536,9 +539,9 @@ def _judged(
 ) -> Residuals:
     """Residuals of the pool's rows that are not gross errors in a model.
 
-    Rows that are near the moment of a step count as gross only if they are so with the step
-    earlier and later, too. `residuals` itself if the rows are the same, or if too many would
-    be gross.
+    A row counts as gross only if it also is with each step dated a little earlier and later.
+    ``pool``: indices of the rows. `residuals` itself if its rows are these already, or if too
+    many rows would be gross.
     """
     every = residuals.only(pool)
     gross = None
@@ -565,15 +568,18 @@ def _judged(
 
 
 def _residuals_as_given(residuals: FloatArray, kept: BoolArray) -> FloatArray:
-    """Return ``residuals`` unchanged, whichever rows are kept: the model is not fitted again."""
+    """Return ``residuals``, m, (n, 3), unchanged: the function for `find_outliers` without refits.
+
+    ``kept``: mask of the rows not set aside, (n,); ignored.
+    """
     return residuals
 
 
 def _left_by_moment(data: Residuals, solution: Solution) -> list[FloatArray]:
-    """Return residuals of a model, m, (n, 3): as it is, and with each step earlier and later.
+    """Return residuals of a model, m, (n, 3) each: as fitted, and with its steps dated otherwise.
 
-    Two more for each candidate of a moment. Rows just before or after a step look gross if the
-    step is dated a little wrong.
+    First those as fitted. Then two more for each candidate that happened at a moment, with it
+    dated a little earlier and later: rows near a step look gross if its date is a little wrong.
     """
     residuals = [data.left(solution)]
     reach = DATED_TO * float(np.ptp(data.context.elapsed_s))

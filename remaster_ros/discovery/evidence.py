@@ -52,7 +52,10 @@ _LARGE = 18.0
 
 
 def log_prior_one_by_one(candidates: Sequence[Candidate]) -> float:
-    """Return the log prior probability of a set of candidates: sum of -log(`drawn_from`)."""
+    """Return the log prior probability of a set of candidates: sum of -log(`drawn_from`).
+
+    `Candidate.drawn_from` is the number of candidates of its kind of which each is one.
+    """
     return -float(sum(np.log(candidate.drawn_from) for candidate in candidates))
 
 
@@ -160,9 +163,9 @@ class System:
         self.of_parameters = packed.length(self.size)
 
     def visible(self) -> bool:
-        """Return whether the unpenalised columns are independent of each other and of the base.
+        """Return whether the unpenalised columns are linearly independent.
 
-        The base columns are what the offsets model can absorb.
+        Both of each other and of the base columns, which the offsets model can absorb.
         """
         part = self.grams[:, : packed.length(self.unpenalised)].sum(axis=0)
         part[packed.diagonal(self.unpenalised)] += 1e-14
@@ -178,10 +181,10 @@ class System:
         return self.model.noise(np.exp(eta[:count]), np.exp(eta[count : len(self.entering)]))
 
     def value(self, eta: FloatArray) -> float:
-        """Return the restricted log likelihood L (see the module), with the Gaussian priors.
+        """Return the restricted log likelihood L of the errors, with the Gaussian priors.
 
-        ``eta``: logs of sigmas, of sigmas of common parts, and of smoothness factors, (e,).
-        Raises numpy.linalg.LinAlgError if H is not positive definite.
+        ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
+        Raises numpy.linalg.LinAlgError if H, the posterior precision, is not positive definite.
         """
         weights, factors = self._precisions(eta)
         total, factor, beta = self._solved(eta)
@@ -189,10 +192,9 @@ class System:
         return float(value + self._smooth(factors, beta))
 
     def marginal(self, eta: FloatArray) -> float:
-        """Return the log likelihood L plus the log normalisation of the parameters' prior.
+        """Return `value` plus half the log prior precision of each unpenalised parameter.
 
-        Of the unpenalised parameters, with their Gaussian prior.
-
+        That completes the normalised Gaussian prior of these parameters.
         ``eta``: logs of noise sigmas, of sigmas of common parts, of smoothness factors, (e,).
         """
         prior = self.ridge[self.p : self.unpenalised]
@@ -286,11 +288,11 @@ class System:
         return 1.0 / (np.exp(2.0 * eta[:count]) @ self.entering), np.exp(eta[count:])
 
     def _solved(self, eta: FloatArray) -> tuple[FloatArray, _Cholesky, FloatArray]:
-        """Return the weighted sum of the Gram matrices, the factor of H, and the estimate.
+        """Return the weighted sum of the Gram matrices, Cholesky factor of H, and estimate.
 
-        The sum is `packed`. H: posterior precision of all parameters; the estimate is in
-        scaled columns, (size,). Raises numpy.linalg.LinAlgError if H is not positive definite.
-        The last result is kept.
+        The sum is `packed`. H: posterior precision of all parameters; the estimate is in scaled
+        columns, (size,). ``eta``: as of `value`; the result for the last one is cached. Raises
+        numpy.linalg.LinAlgError if H is not positive definite.
         """
         if self._last is not None and np.array_equal(self._last[0], eta):
             return self._last[1]
@@ -311,9 +313,10 @@ class System:
         return self._last[1]
 
     def solution(self, start: Solution | None, prior: float) -> Solution:
-        """Return the fit at the maximum of L; ``prior``: log prior added to its evidence.
+        """Return the fit at the noise and smoothness that maximise L.
 
-        The search begins at the noise and smoothness of ``start``, if given.
+        ``start``: fit at whose noise and smoothness the search begins, or None for a first
+        guess; ``prior``: log prior probability, added to the log evidence.
         """
         known = {} if start is None else start.factors()
         noise = self.guess if start is None else start.noise
@@ -370,11 +373,11 @@ class System:
         factors: FloatArray,
         beta: FloatArray,
     ) -> float:
-        """Return L with ½ log N for each unpenalised parameter in place of its determinant.
+        """Return L with ½ log N for each unpenalised parameter in place of its log determinant.
 
-        The Bayesian information criterion for these. ``total``: weighted Gram matrix,
-        `packed`; ``root``: Cholesky factor of H; ``weights``, ``factors``: as of
-        `_precisions`; ``beta``: the estimate.
+        That is the Bayesian information criterion; N: degrees of freedom. ``total``: weighted
+        Gram matrix, `packed`; ``root``: Cholesky factor of H; ``weights``, ``factors``: as
+        returned by `_precisions`; ``beta``: the estimate in scaled columns, (size,).
         """
         logs = np.log(np.diag(root))
         value = self._likelihood(total, weights, beta) - logs[: self.p].sum()
@@ -382,16 +385,21 @@ class System:
         return float(value - logs[self.unpenalised :].sum() + self._smooth(factors, beta))
 
     def _likelihood(self, total: FloatArray, weights: FloatArray, beta: FloatArray) -> float:
-        """Return the log likelihood at an estimate, with all priors except the smoothness."""
+        """Return the log likelihood at an estimate, with all priors except the smoothness.
+
+        ``total``: weighted Gram matrix, `packed`; ``weights``: precision of each error group;
+        ``beta``: the estimate in scaled columns, (size,).
+        """
         error = np.append(-beta, 1.0)
         square = error @ dspmv(len(error), 1.0, total, error)
         value = 0.5 * self.model.freedom @ np.log(weights) - 0.5 * square
         return float(value - 0.5 * self._implausible(beta))
 
     def _smooth(self, factors: FloatArray, beta: FloatArray) -> float:
-        """Return the log prior density of the penalised parameters by their smoothness.
+        """Return the log prior density of the penalised parameters by their smoothness penalties.
 
-        ``factors``: of each penalty; ``beta``: the estimate, (size,).
+        ``factors``: smoothness factor of each penalty; ``beta``: the estimate in scaled columns,
+        (size,). The quadratic term of the ridge is left to `_implausible`.
         """
         value = 0.0
         for index, penalty, spectrum, ridge, factor in zip(
@@ -403,7 +411,10 @@ class System:
         return value
 
     def _implausible(self, beta: FloatArray) -> float:
-        """Return beta' P beta of all parameters, P their prior precision without smoothness."""
+        """Return the quadratic form beta' P beta of the estimate in scaled columns, (size,).
+
+        P: prior precision of all parameters without the smoothness penalties.
+        """
         base = beta[: self.p]
         return float(self.ridge @ beta**2 + base @ self.base_precision @ base)
 
@@ -467,9 +478,10 @@ class _Cholesky:
 
 
 def _covariances(H: _Cholesky, unit: FloatArray, first: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of all parameters, and that of the first ones given all others.
+    """Return two covariances: of all parameters, and of the first ones if the others are known.
 
-    Inverses of H and of its first block, divided by the scales ``unit``, (size,).
+    They are the inverses of H and of its block of the first ``first`` parameters, (size, size)
+    and (first, first). ``unit``: scales of the columns, by which both are divided, (size,).
     """
     full = H.inverse + H.inverse.T
     np.einsum('ii->i', full)[:] *= 0.5

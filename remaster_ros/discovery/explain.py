@@ -115,9 +115,10 @@ class FoundEffect(Struct, frozen=True):
     ) -> FoundEffect:
         """Return a copy of the effect with a sampled fit's parameters and a complete sentence.
 
-        ``result``: the sampled fit; ``group``, ``data``: the effect's candidates and the
-        residuals they were fitted to: if given, its sizes are set, too. The sentence gets the
-        sizes, and a warning unless the cause is certain.
+        ``result``: the sampled fit; ``group``: the effect's candidates; ``data``: the residuals
+        they were fitted to. If both are given, the effect's sizes are computed anew. The
+        sentence gets the sizes. If the cause is not certain, it gets a warning, and the remedy
+        is put off until more poses are measured.
         """
         found = self
         index = {name: i for i, name in enumerate(result.theta_names)}
@@ -219,8 +220,8 @@ def describe(
 ) -> tuple[tuple[tuple[Candidate, ...], ...], tuple[FoundEffect, ...]]:
     """Return the causes of a walk's best model: their candidates, and their descriptions.
 
-    The largest first. Causes that may be noise with memory are left out. ``progress``: called
-    with the share done.
+    The largest first. Causes that may be noise correlated in time are left out. ``progress``:
+    called with the share done.
     """
     data, solution = walk.data, walk.best
     groups = [group for group in grouped(walk.claimed) if not _may_be_memory(walk, group)]
@@ -234,10 +235,11 @@ def describe(
 
 
 def _may_be_memory(walk: Walk, group: tuple[Candidate, ...]) -> bool:
-    """Return whether a cause may be noise with memory, which looks like what changes as slowly.
+    """Return whether a cause may be noise correlated in time, which looks like a slow change.
 
-    So if it gains no log posterior when only the independent share of the readings counts.
-    False for structure that is no cause, and if all readings are independent.
+    True if the cause gains no log posterior when the readings count only by the share of them
+    that is independent. False if all readings are independent, or if the group is structure
+    without a cause (`Effect.is_cause`).
     """
     share = walk.independent_share
     is_cause = EFFECTS[group[0].name].is_cause
@@ -270,7 +272,8 @@ def grouped(candidates: Sequence[Candidate]) -> list[tuple[Candidate, ...]]:
 def _described(walk: Walk, group: tuple[Candidate, ...], share: float) -> FoundEffect:
     """Description of a cause for the report.
 
-    ``group``: its candidates in the best model; ``share``: as in `FoundEffect`.
+    ``group``: its candidates in the best model; ``share``: of the gain on held-out poses that
+    is lost without it, see `shares`.
     """
     data, solution, first = walk.data, walk.best, group[0]
     wheres = dict(zip(solution.candidates, solution.slices(), strict=True))
@@ -349,8 +352,9 @@ def _joints(group: Sequence[Candidate]) -> tuple[int, ...]:
 def _look_alikes(walk: Walk, group: tuple[Candidate, ...], gain: float) -> tuple[LookAlike, ...]:
     """Return the other causes that models have in the place of a group, the likeliest first.
 
-    ``gain``: log posterior gained by the group. One for each name and joints; causes with a
-    probability below `MENTIONED` are left out.
+    ``gain``: log posterior gained by the group; a look-alike's gain is this plus the log ratio
+    of the probabilities. One for each name and joints; causes with a probability below
+    `MENTIONED` are left out.
     """
     candidate, own_chance = group[0], max(walk.probability_of(candidate) for candidate in group)
     best: dict[tuple[str, tuple[int, ...]], LookAlike] = {}
@@ -423,9 +427,10 @@ class SearchRecord(Struct, frozen=True):
 
     @classmethod
     def of(cls, walk: Walk, named: Sequence[tuple[Candidate, ...]]) -> SearchRecord:
-        """Return the record of a walk, with the likelier causes that are not among `named`.
+        """Return the record of a walk, with probable causes that are not named.
 
-        ``named``: candidates of each named cause.
+        ``named``: candidates of each named cause. Listed are at most `MOST_LISTED` other causes,
+        of a probability of at least `LISTED_FROM`, the likeliest first.
         """
         taken = {at_any_time(candidate) for group in named for candidate in group}
         candidates = {
@@ -563,10 +568,11 @@ def shares(
 ) -> list[float]:
     """Return the share of the gain in mean square that is lost without each cause, (groups,).
 
-    Everything else is fitted again, with noise and variances as they are. Judged on held-out
-    rows, or on the rows worked on if there are none. Two causes that imitate each other lose
-    little each: the shares need not add up to 1. Negative for a cause without which these rows
-    are predicted better; all 0 if all causes together gain nothing.
+    ``groups``: candidates of each cause, all in ``solution``. Without one cause all other
+    parameters are fitted again, at the same noise and prior variances. The errors are those of
+    held-out rows, or of the rows worked on if there are none. The shares need not add up to 1:
+    causes that imitate each other lose little each. A share is negative if the errors are smaller
+    without the cause; all are 0 if all causes together gain nothing.
     """
     rows = data.context.measurements.is_validation
     if not rows.any():

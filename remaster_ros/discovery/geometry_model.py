@@ -102,14 +102,14 @@ class GeometryModel:
         return bool(gains.mean() > PLAINLY * gains.std(ddof=1) / np.sqrt(len(poses)))
 
     def beside(self, offsets_fit: FitResult, gross: Sequence[int]) -> GeometryModel:
-        """Return a copy judged against a fit of the zero-offsets that can be loaded instead.
+        """Return a copy that is compared with a given fit of the zero-offsets alone.
 
         Parameters
         ----------
         offsets_fit
-            That fit; its residuals are those of the drawing.
+            The fit that could be loaded instead; its residuals become `drawing_errors`.
         gross
-            ``observation`` of the gross errors, which do not count.
+            ``observation`` of the gross errors, which are taken out of `judged`.
         """
         counts = ~np.isin(offsets_fit.measurements.observation, gross)
         return replace(
@@ -117,9 +117,10 @@ class GeometryModel:
         )
 
     def offsets_std(self, std: FloatArray) -> FloatArray:
-        """Return standard deviations of the zero-offsets if the arm is not exactly its drawing.
+        """Return standard deviations of the zero-offsets of an arm that differs from its drawing.
 
-        ``std``: if it is, rad or m, (k,). Lengths and tilts count with their prior.
+        ``std``: those of an arm exactly as drawn, rad or m, (k,). The change of an offset by each
+        length and tilt of one prior standard deviation is added in quadrature.
         """
         moved: FloatArray = np.hypot(std, np.linalg.norm(self.offset_moves, axis=1))
         return moved
@@ -206,11 +207,12 @@ def _loaded(
     theta: FloatArray,
     causes: Sequence[Candidate],
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray] | None:
-    """Return shifts, turns, zero-offsets and errors on the arm that fitted candidates describe.
+    """Return shifts, turns, zero-offsets and errors of the arm that fitted candidates describe.
 
-    Everything else is fitted again on that arm. Shapes (k, 3), (k, 3), (k,) and (n, 3).
-    ``theta``: values of the parameters of ``candidates``; ``causes``: errors of the
-    measurement to fit, too. None if that cannot be fitted.
+    The joints' origins are shifted, m, and turned, rad, (k, 3) each; then zero-offsets, (k,),
+    registrations and markers are fitted again on that arm, which leaves errors, m, (n, 3).
+    ``candidates``: lengths and tilts; ``theta``: values of their parameters; ``causes``: errors
+    of the measurement to fit, too. None if that cannot be fitted.
     """
     chain = found.problem.chain
     shifts, turns = np.zeros((2, len(chain), 3))
@@ -302,9 +304,10 @@ def _tilts(context: Context) -> list[Candidate]:
 
 
 def _offset_moves(found: Estimate, data: Residuals, families: Sequence[Family]) -> FloatArray:
-    """Return what a unit weight of each length and tilt does to the zero-offsets, (k, m).
+    """Return the change of the zero-offsets by a unit weight of each length and tilt, (k, m).
 
-    In a fit with offsets alone, rad or m per m. ``families``: of lengths and tilts.
+    In a fit of an arm exactly as drawn to errors that the length or tilt causes; rad or m, per m
+    RMS displacement of the marker. ``families``: random effects of lengths and of tilts.
     """
     free = found.posterior.free
     known = data.full_jacobian[data.rows.source][:, :, free]

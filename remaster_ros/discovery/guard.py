@@ -55,7 +55,7 @@ def suggested(effects: Sequence[FoundEffect]) -> str:
 def is_harmful(gain: Gain) -> bool:
     """Return whether causes make the error on held-out poses larger by more than 5 %.
 
-    Without gross errors. False if no poses are held out.
+    Gross errors are not counted. False if no poses are held out.
     """
     # Gross errors, which are there with and without causes, would hide what these do.
     before, after = gain.held_out_kept_before_m, gain.held_out_kept_after_m
@@ -107,9 +107,10 @@ def harm_of(
 def unfitted(
     errors: FloatArray, effects: Sequence[FoundEffect], reason: InsufficientDataError
 ) -> Unexplained:
-    """Return an entry on errors whose suggested causes cannot be fitted with all else.
+    """Return an entry on errors whose suggested causes cannot be fitted along with the offsets.
 
-    ``errors``: residuals, m, (n, 3); ``reason``: why they cannot.
+    ``errors``: residuals that the causes were to explain, m, (n, 3); ``effects``: the suggested
+    causes; ``reason``: why they cannot be fitted.
     """
     names = suggested(effects)
     return Unexplained(
@@ -128,8 +129,8 @@ def unfitted(
 def nameless(data: Residuals, solution: Solution, p_value: float) -> Unexplained:
     """Return an entry on errors that are more than noise, but have no single likely cause.
 
-    ``solution``: fit of all kinds of errors as their members; ``p_value``: of gaining as much
-    by chance.
+    ``solution``: fit with the candidates of all kinds of errors at once; ``p_value``: probability
+    of such a gain in pure noise.
     """
     kinds: dict[str, list[Candidate]] = {}
     for candidate in solution.candidates:

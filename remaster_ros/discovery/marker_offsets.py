@@ -100,9 +100,10 @@ def loosened(session: Session, moved: Sequence[FoundEffect]) -> Priors | None:
 def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolArray) -> FloatArray:
     """Return the covariance of a marker's place due to directions that the data leave open.
 
-    m², (3, 3). ``moved``: estimated move, m, (3,); ``place``: stated, in the tool frame, m;
-    ``axes``: orthonormal directions as columns; ``seen``: which of these the data determine.
-    In open directions a move as large as in the others is assumed.
+    m², (3, 3). In each open direction the standard deviation is that of the estimated move in
+    one of the determined directions. ``moved``: estimated move, m, (3,); ``place``: stated, in
+    the tool frame, m, (3,); ``axes``: orthonormal directions as columns; ``seen``: mask of those
+    that the data determine.
     """
     typical = np.sum(moved**2) / max(1, int(seen.sum()))
     hidden = axes[:, ~seen]
@@ -115,7 +116,10 @@ def _unseen(moved: FloatArray, place: FloatArray, axes: FloatArray, seen: BoolAr
 
 
 def _projected(basis: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the projection of columns (r, c) on the span of a basis, which may be dependent."""
+    """Return the projection of columns (r, c) on the span of the columns of a basis, (r, b).
+
+    The columns of the basis may be linearly dependent.
+    """
     scale = np.linalg.norm(basis, axis=0)
     unit = basis / np.where(scale > 0.0, scale, 1.0)
     # By pivoted QR: the singular values would take three times as long.

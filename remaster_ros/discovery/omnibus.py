@@ -267,9 +267,10 @@ class _Checks:
         )
 
     def held_out(self) -> Iterator[Unexplained]:
-        """Yield an entry if held-out poses have larger errors than poses left out of the fit.
+        """Yield an entry if errors on held-out poses are larger than on fitted poses left out.
 
-        Those are left out in turn and predicted by the others; gross rows do not count.
+        Fitted poses are left out of the fit in turn and predicted by the others. Gross held-out
+        rows do not count. Nothing without held-out rows, or if chance may explain the difference.
         """
         data = self.data
         held_out = data.context.measurements.is_validation & ~self.gross
@@ -298,7 +299,11 @@ class _Checks:
         )
 
     def beyond_stated(self) -> Iterator[Unexplained]:
-        """Yield an entry for each sensor that errs more than it states, or than any instrument."""
+        """Yield an entry for each sensor whose mean error is too large for it.
+
+        Either larger than noise of the sensor's stated standard deviation explains, or larger
+        than that of any instrument.
+        """
         for check in self.fit.noise_checks:
             if check.is_of_no_instrument:
                 yield Unexplained('noise', 'unknown', check.after_m, None, check.no_instrument)
@@ -351,12 +356,12 @@ def beyond_noise(data: Residuals, fit: FitResult) -> Iterator[Unexplained]:
 def errors_by_place(
     data: Residuals, solution: Solution, significance: float
 ) -> Iterator[Unexplained]:
-    """Yield an entry for each sensor whose errors depend on the place in its frame.
+    """Yield an entry for each sensor whose errors depend on the marker's position in its frame.
 
-    One F test a sensor: do polynomials of the position up to the second degree explain more of
-    the pose means than noise would, beside all causes found? ``significance``: largest p-value
-    that counts. Sensors with a field in the model, or next to no noise, are left out. It shows
-    what is too little for a cause of its own.
+    By an F test for each sensor: whether polynomials of the position up to the second degree,
+    added to all causes found, explain more of the pose means than noise would. ``significance``:
+    largest p-value that counts. Sensors with a field in the model, or with hardly any noise, are
+    left out. The test finds errors that are too small to be named as a cause.
     """
     rows, candidates = data.rows, solution.candidates
     parts = [data.base, data.columns(candidates), data.errors[:, :, None], of_position(rows)]
@@ -400,10 +405,11 @@ def errors_by_place(
 def compared_held_out(
     data: Residuals, solution: Solution, source: IntArray
 ) -> tuple[tuple[int, float, float], ...]:
-    """Compare errors of held-out rows with errors of poses left out of the fit in turn.
+    """Compare errors of held-out rows with errors of fitted poses left out of the fit in turn.
 
-    Results as of `left_out.compared`; () without rows. ``source``: indices of the held-out
-    rows, (m,), thinned to evenly spread poses if they are many.
+    Returns (kind of contrast, p-value, ratio of the typical errors) for each kind with enough
+    poses, see `left_out.compared`; () without rows. ``source``: indices of the held-out rows,
+    (m,), thinned to evenly spread poses if they are many.
     """
     measurements = data.context.measurements
     source = of_spread_poses(measurements, source)

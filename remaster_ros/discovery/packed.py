@@ -29,9 +29,10 @@ def diagonal(size: int) -> IntArray:
 
 
 def of_rows(rows: FloatArray, first: int) -> FloatArray:
-    """Return rows of symmetric matrices in packed form, up to the diagonal, (…, elements).
+    """Return some last rows of symmetric matrices in packed form, (…, elements).
 
-    ``rows``: the rows from number ``first`` on, (…, size − first, size).
+    Of each row the elements up to the diagonal. ``rows``: all rows from index ``first`` on,
+    (…, size − first, size).
     """
     size = rows.shape[-1]
     up_to_diagonal = np.arange(size) <= np.arange(first, size)[:, None]
@@ -39,7 +40,7 @@ def of_rows(rows: FloatArray, first: int) -> FloatArray:
 
 
 def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
-    """Add the columns' products X'X to a packed matrix in place, from its row ``first`` on.
+    """Add X'X to a packed matrix in place, only in its rows from index ``first`` on.
 
     ``columns``: X, (r, size).
     """
@@ -51,9 +52,10 @@ def add_products(matrix: FloatArray, columns: FloatArray, first: int) -> None:
 
 
 def picked(matrices: FloatArray, order: IntArray) -> FloatArray:
-    """Return packed matrices with some rows and columns in a given order, (m, elements).
+    """Return packed matrices of some rows and the same columns, in a given order, (m, elements).
 
-    ``matrices``: (m, length); ``order``: their indices. Not to be changed: it may be a view.
+    ``matrices``: (m, length); ``order``: indices of the rows to pick. Not to be changed in place:
+    the result may be a view.
     """
     if np.array_equal(order, np.arange(len(order))):
         return matrices[:, : length(len(order))]

@@ -36,7 +36,7 @@ LEAST_SHARE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """Random effects of one kind of error: weights of all its members, with one variance."""
+    """Random effects of one kind of error: weights of all its candidates share one variance."""
 
     candidate: Candidate  # Of the weights of all members, m, with a penalty of one
     members: tuple[Candidate, ...]  # The candidates that displace a marker
@@ -61,11 +61,11 @@ class Family:
         least: float = 0.0,
         alike: Sequence[Candidate] = (),
     ) -> Family | None:
-        """Make the family of some candidates; None if none of them displaces a marker.
+        """Make the family of some candidates (members); None if none of them displaces a marker.
 
-        ``least``: lower limit on the standard deviation of its weights, m; ``alike``:
-        candidates whose joints give the lever arm, m/rad, by which added joint angles count;
-        the members by default.
+        ``name``: of the family; ``least``: lower limit on the standard deviation of its weights,
+        m. Errors of joint angles are scaled to m by one RMS lever arm, m/rad, of all joints of
+        the candidates ``alike``, or of ``members`` if that is empty.
         """
         seen, maps, scales, largest = [], [], [], []
         lever = _lever(data, alike or members)
@@ -125,9 +125,10 @@ def _lever(data: Residuals, members: Sequence[Candidate]) -> float:
 
 
 def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[FloatArray]) -> Design:
-    """Return columns of a family's weights: displacements by its members through their maps.
+    """Return the displacement of the marker by a unit of each weight of a family, as columns.
 
-    ``maps``: from weights to parameters, one for each member.
+    ``maps``: for each of ``members`` the matrix that turns its weights into its parameters,
+    (parameters, weights).
     """
     parts = [
         member.columns(context).displacement(context) @ mapping
@@ -139,12 +140,13 @@ def _columns(context: Context, members: Sequence[Candidate], maps: Sequence[Floa
 def kinds(
     data: Residuals, candidates: Sequence[Candidate], singles: Sequence[Candidate] = ()
 ) -> list[Family]:
-    """Return a family for each effect among some candidates.
+    """Return a family of random effects for each effect (kind of error) among some candidates.
 
-    Left out are changes in mid-session, candidates that are of a cause among ``singles`` or
-    share a parameter with these or a larger member, and variants by `Effect.in_family`.
-    Effects drawn from thousands (`Effect.many`: orders of a gear, steps, unnamed) are no
-    family: with one variance each would be lost among the others.
+    Left out are changes in mid-session; candidates with the name, joints and subject of one of
+    ``singles``, the causes that are fitted by themselves; candidates that share a parameter with
+    these or with a larger member; and variants by `Effect.in_family`. Effects with thousands of
+    candidates (`Effect.many`: orders of a gear, steps, unnamed) have no family, as a single one
+    would be lost among so many.
     """
     taken = {name for candidate in singles for name in candidate.parameters}
     taken_places = {(candidate.name, candidate.joints, candidate.subject) for candidate in singles}

@@ -88,7 +88,10 @@ class Residuals:
 
     @classmethod
     def at(cls, found: Estimate, mode: Mode) -> Residuals:
-        """Return the residuals of a fit with offsets at another mode, on the rows that it kept."""
+        """Return the residuals of a fit with offsets at a given mode, on the rows that it kept.
+
+        ``mode``: parameter values to use in place of ``found.mode``.
+        """
         problem, model = found.problem, found.model
         x = model.natural(mode.z)
         context = Context(
@@ -164,9 +167,10 @@ class Residuals:
         return replace(self, full_errors=full_errors, errors=full_errors[self.rows.source])
 
     def only(self, source: IntArray) -> Residuals:
-        """Return a copy that works on other rows; ``source``: their indices among all rows.
+        """Return a copy that works on other rows; ``source``: their indices in the session.
 
-        The base columns remain those of the rows before: not orthonormal over the new ones.
+        The base columns are not made anew: they are orthonormal over the previous rows, not over
+        these.
         """
         rows = Rows.of(self.context.measurements, np.sort(source), self.reference)
         rows = rows.along_path(self.path_noise)
@@ -224,9 +228,10 @@ class Residuals:
 
     @cached_property
     def _grams(self) -> list[tuple[tuple[Candidate, ...], FloatArray, FloatArray]]:
-        """Cache of the last `gram_matrices`: candidates, norms, packed matrices, latest first.
+        """Cache of the last results for `gram_matrices`: (candidates, norms, packed matrices).
 
-        In the order base, errors, candidates. A search fits parts of a set, or the set and one
+        The latest is first; columns are in the order base, errors, candidates. At first it has
+        one entry, without candidates. A search often fits part of an earlier set, or one
         candidate more.
         """
         return [((), *self._grams_of((), np.empty((1, 0)), 0))]
@@ -256,9 +261,10 @@ class Residuals:
         return norms[order], packed.picked(grams, order)
 
     def _positions(self, known: Sequence[Candidate], candidates: Sequence[Candidate]) -> IntArray:
-        """Return the indices of base, errors and some candidates in the Gram matrices of a set.
+        """Return indices of the base, the errors and some candidates in a set's Gram matrices.
 
-        ``known``: candidates of that set, in order, with all of ``candidates`` among them.
+        ``known``: all candidates of that set, in order; ``candidates``: those wanted, all among
+        these.
         """
         count = self.base.shape[2] + 1
         first = dict(
@@ -275,8 +281,8 @@ class Residuals:
     ) -> tuple[FloatArray, FloatArray]:
         """Return norms and packed Gram matrices of the columns [base, errors, candidates].
 
-        ``first``: packed matrices of the first ``known`` columns, which are not computed
-        again, (groups or 1, length).
+        ``known``: number of first columns whose packed matrices are given as ``first``,
+        (groups or 1, length), and so are not computed.
         """
         p = self.base.shape[2]
         columns = self.base, self.errors[:, :, None], self.columns(candidates)
@@ -338,9 +344,10 @@ def units(candidates: Sequence[Candidate], norms: FloatArray) -> FloatArray:
 
 
 def _quadratic(precision: FloatArray, combinations: FloatArray) -> FloatArray:
-    """Return the precision (p, p) of coefficients that combine parameters.
+    """Return the prior precision C'PC of p coefficients of combinations C of parameters, (p, p).
 
-    ``precision``: diagonal, of the parameters, (c,); ``combinations``: (c, p).
+    ``precision``: diagonal of P, the prior precision of the parameters, (c,);
+    ``combinations``: C, (c, p).
     """
     return combinations.T @ (precision[:, None] * combinations)
 

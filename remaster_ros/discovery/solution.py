@@ -24,9 +24,10 @@ class Covariances:
 
     @cached_property
     def both(self) -> tuple[FloatArray, FloatArray]:
-        """Covariance of base and parameters, and that of the unpenalised if the others are known.
+        """Covariance of all, and that of base and unpenalised if the penalised are known.
 
-        As returned by `compute`.
+        Of the p base coefficients and the parameters, (p + m, p + m) and (p + u, p + u): m
+        parameters, u of them without a penalty. Computed once.
         """
         return self.compute()
 
@@ -69,9 +70,10 @@ class Solution:
         }
 
     def weight_precisions(self) -> dict[Candidate, float]:
-        """Return the prior precision of the weights of each candidate that is a family.
+        """Return the prior precision of the weights of each family of random effects.
 
-        Smoothness plus ridge; NaN for candidates without a penalty.
+        By the family's candidate: smoothness factor plus ridge. The other candidates are keys,
+        too: NaN if they have no penalty.
         """
         first = [where.start for where in self.slices()]
         return dict(zip(self.candidates, self.smoothness + self.ridge[first], strict=True))

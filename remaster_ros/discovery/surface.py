@@ -69,7 +69,7 @@ Model = tuple[tuple[int, int], ...]
 class Block:
     """Candidate cause with its parameters scaled to weights, which move the marker by 1 m RMS.
 
-    ``map`` leads from weights to parameters. RMS is over the rows worked on; of a penalised
+    Parameters are ``map`` times the weights. RMS is over the rows worked on; of a penalised
     candidate all weights together move it so.
     """
 
@@ -86,9 +86,10 @@ class Block:
 
     @property
     def log_prior(self) -> float:
-        """Log prior odds of this candidate at one level, if its effect is in the model already.
+        """Log prior odds of the candidate at one level, if its effect is in the model already.
 
-        Shared out evenly among the effect's candidates and the block's allowed levels.
+        -log of the number of candidates of its kind times that of the block's allowed levels,
+        which are prior sizes of its weights.
         """
         return -float(np.log(self.candidate.drawn_from * self.allowed.sum()))
 
@@ -108,9 +109,10 @@ class Block:
         return {}
 
     def weights(self, level: int) -> Candidate:
-        """Return the block's weights as a candidate, with the prior std `LEVELS_M[level]`, m.
+        """Return the block's weights as a candidate, whose parameters are the weights.
 
-        The same object at each call.
+        ``level``: index of their prior standard deviation in `LEVELS_M`, m. Cached: the same
+        object for the same level.
         """
         if level not in self._weights:
             self._weights[level] = Candidate(
@@ -161,9 +163,10 @@ def blocks_of(data: Residuals, candidates: Sequence[Candidate]) -> list[Block]:
 
 
 def _largest(data: Residuals, candidate: Candidate) -> float:
-    """Return the RMS displacement by a joint curve of its largest plausible size, m.
+    """Return the RMS displacement of the marker by the largest plausible error of a joint, m.
 
-    Infinity if the candidate does not add to a joint's angle, or has no such size.
+    The error is `Candidate.largest`. Infinity if that is None, or if the candidate does not add
+    to a joint's position.
     """
     at = candidate.columns(data.part).at
     if at is None or candidate.largest is None:
@@ -349,8 +352,9 @@ class Surface:
     def products(self, block: int, gains: FloatArray | None = None) -> Single:
         """Return the products of a block's columns with all columns, (weights, m).
 
-        ``gains``: of a `State`, (blocks, levels): if given, products of the blocks that gain
-        most are computed, too, as all columns are read from memory once.
+        ``gains``: gain in log posterior by each block and level, `State.gains`. If given,
+        the products of the blocks with the largest gains are computed and kept as well, since
+        all columns have to be read from memory anyway.
         """
         if not self.is_known(block):
             ahead = [block]
@@ -379,7 +383,8 @@ class Surface:
     def _turn(self, columns: Single, first: int) -> None:
         """Turn the weights of each block to the principal axes of its Gram matrix, in place.
 
-        ``columns``: those from the index ``first`` on, whitened.
+        ``columns``: whitened columns of the last blocks, those from column index ``first`` on;
+        only these blocks are turned.
         """
         new = self.pool.first >= first
         start, sizes = self.pool.first[new] - first, self.pool.sizes[new]
@@ -451,7 +456,10 @@ class State:
 
     @cached_property
     def regression(self) -> Single:
-        """Coefficients of all m columns on the model's q columns, with their prior, (q, m)."""
+        """Coefficients of the ridge regression of all m columns on the model's q columns, (q, m).
+
+        The ridge is the prior precision of the model's weights.
+        """
         assert self._regression is not None
         found = self._regression(slice(None))
         # Columns and states before are kept no longer.
@@ -538,9 +546,10 @@ class State:
         return lost
 
     def with_block(self, block: int, level: int) -> State:
-        """Return the state with one block more; this one is not changed, but for its exact gain.
+        """Return the state with one block more; this one is not changed, except one of `gains`.
 
-        ``block``: index in the pool; ``level``: index in `LEVELS_M`.
+        If `gains` is known, that of the block at the level becomes exact. ``block``: index in
+        the pool; ``level``: index in `LEVELS_M`.
         """
         surface, pool = self.surface, self.surface.pool
         block_columns = pool.of[block]
@@ -617,7 +626,7 @@ class State:
 
     @cached_property
     def kinds(self) -> list[int]:
-        """Number of the kind of each of the model's blocks."""
+        """Index of the effect (kind of error) of each of the model's blocks, see `Pool.kind`."""
         return [int(self.surface.pool.kind[block]) for block, _ in self.model]
 
     def _prior(self, block: int, there: bool) -> float:
@@ -651,7 +660,7 @@ class Walker:
     def step(self, heat: float) -> None:
         """Propose one move and accept or refuse it: a block joins, leaves or is exchanged.
 
-        Or two are changed. Block: a candidate cause. ``heat``: exponent of the posterior, the
+        Or two blocks join. Block: a candidate cause. ``heat``: exponent of the posterior, the
         inverse of a temperature; 1 for the posterior itself, less for wider moves.
         """
         u, state = self.rng.random(), self.state
@@ -709,7 +718,8 @@ class Walker:
     def _which(self, state: State, heat: float) -> int:
         """Draw one of the model's blocks (causes) to leave out; return its position in the model.
 
-        Half of the probability is by exp(-heat × loss in log posterior), half is even.
+        The probability is the mean of an even one and one in proportion to exp(-heat × loss in
+        log posterior). ``heat``: an inverse temperature.
         """
         chance = np.exp(-heat * (state.losses - state.losses.min()))
         chance = 0.5 * chance / chance.sum() + 0.5 / len(chance)

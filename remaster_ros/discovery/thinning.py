@@ -34,7 +34,7 @@ FEWEST_ROWS = 2
 
 
 class Thinning(Struct, frozen=True):
-    """Number of rows searched for causes, and RMS errors with the causes on all other rows."""
+    """Number of rows searched for causes, and RMS errors of the rows that were not searched."""
 
     # Rows that were searched, and all that could have been
     searched: int
@@ -109,7 +109,10 @@ def judge_by_others(
 
 
 def _one_of_each(count: int, strata: int, rng: np.random.Generator) -> IntArray:
-    """Draw one number from each of `strata` runs of about equal length of 0 … count − 1."""
+    """Draw one index from each of `strata` successive parts of 0 … count − 1, (strata,).
+
+    The parts are of about equal length; count is at least strata.
+    """
     edges = np.linspace(0, count, strata + 1).astype(np.int64)
     return edges[:-1] + (rng.random(strata) * np.diff(edges)).astype(np.int64)
 

@@ -15,9 +15,11 @@ from remaster_ros.types import FloatArray
 
 
 def extension_of(residuals: Residuals, solution: Solution, found: Estimate) -> Extension:
-    """Return a solution's candidates as parameters of the model that is sampled.
+    """Return a solution's candidates as further parameters of the model that is sampled.
 
-    Linearised at their values in ``solution``; parameters of motion of the model stay.
+    Errors of a joint add to its position; displacements of the marker are linear about the
+    parameters of ``solution``, at which the sampling starts. Parameters of motion that the model
+    of ``found`` has already are kept.
     """
     terms = []
     displacement0 = np.zeros((len(residuals.context), 3))

@@ -66,10 +66,11 @@ class Unmodelled:
         return int(self.found.model.size + len(self.solution.parameters))
 
     def by_models(self, models: Sequence[tuple[Solution, float]]) -> FloatArray:
-        """Return the change of all parameters to each other model, times the root of its share.
+        """Return the change of all parameters to each other model, times the root of its weight.
 
-        (size, models). The sum of the squares of a row is a variance among the models. A
-        candidate that the other model lacks counts as 0 there.
+        ``models``: the other models, each with its posterior weight. (size, models); the sum of
+        squares of a row is that parameter's variance among the models. A parameter that another
+        model lacks counts as 0 there.
         """
         first, names = self.solution, _names(self.solution)
         size = self.found.model.size
@@ -88,13 +89,15 @@ class Unmodelled:
     def by_drawing(self, named: Sequence[Candidate]) -> FloatArray:
         """Return columns F, (size, c), by which lengths and tilts off their drawing move the fit.
 
-        They add FF' to the covariance. ``named``: causes that are named, which are left out.
+        They add FF' to the covariance. ``named``: candidates of the named causes; lengths and
+        tilts among these are left out.
 
-        No session proves that an arm is its drawing. As random effects of its tolerance beside
-        the model they add L U G⁻¹ U'L' to the covariance LL' of all that is fitted, with their
-        columns Z, those of the model A, U = L'A'Z and G = I + Z'Z - U'U: what the data show them
-        not to be counts as little. Of those that the model has, what their prior lacks of the
-        tolerance.
+        No session proves that an arm is exactly its drawing, so the lengths and tilts are added
+        to the model as random effects with the drawing's tolerance. With their columns Z, the
+        model's columns A and its covariance LL', they add L U G⁻¹ U'L' to the covariance, with
+        U = L'A'Z and G = I + Z'Z - U'U: the more the data contradict them, the less they add.
+        For a length or tilt that the model has already, only the variance that its prior lacks
+        of the tolerance is added.
         """
         candidates = [
             candidate
@@ -124,11 +127,12 @@ class Unmodelled:
         return moves
 
     def by_open_offsets(self) -> FloatArray:
-        """Return columns by which zero-offsets move that only the prior on steps holds, (size, c).
+        """Return columns by which zero-offsets may move that the data hardly determine, (size, c).
 
-        That prior is no knowledge of the arm: the columns replace it by what is known of any
-        mastering (`OFFSET_STD`). One for each offset whose variance it reduces noticeably; all
-        other parameters move along. Offsets with a stated prior have none.
+        In the sampled fit they are held by the prior on their steps (`STEP_STD`), which is no
+        knowledge of the arm. The columns widen the variance to that with a prior of any mastering
+        (`OFFSET_STD`): one for each offset whose variance the prior on steps reduces noticeably,
+        with the other parameters moving along. Offsets with a stated prior have none.
         """
         found = self.found
         names = found.problem.chain.joint_names
@@ -153,10 +157,10 @@ class Unmodelled:
         return moves
 
     def std_of_offsets(self, moves: Sequence[FloatArray]) -> FloatArray:
-        """Return the standard deviation of the zero-offsets with some movements added, (k,).
+        """Return the standard deviation of the zero-offsets, with some further uncertainty, (k,).
 
         rad or m; NaN for offsets that the fit holds fixed. ``moves``: columns, (size, c) each,
-        whose squares add to the variance.
+        whose squares are added to the variances.
         """
         variance = np.full(self.size, np.nan)
         variance[self.where] = np.sum(self.root**2, axis=1)

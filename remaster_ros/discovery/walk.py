@@ -86,10 +86,10 @@ Identity = tuple[str, tuple[int, ...], str, str, str, str]
 
 
 def identity(candidate: Candidate) -> Identity:
-    """Return what identifies a candidate's cause: candidates that differ in less are one cause.
+    """Return the key of a candidate's cause, equal for candidates of the same cause.
 
-    Name, joints, place, driver, subject, and '', 'begins' or 'ends'; without moment, order or
-    axis.
+    Name, joints, place, driver, subject, and whether a change in mid-session 'begins' or 'ends'
+    ('' for no change). Candidates that differ only in moment, order or axis have the same key.
     """
     change = '' if candidate.changes is None else 'ends' if candidate.ends else 'begins'
     return (
@@ -108,10 +108,10 @@ def at_any_time(candidate: Candidate) -> Identity:
 
 
 def _claims(candidate: Candidate) -> Identity:
-    """Return the key of `Walk.probability` by which a candidate's cause counts as present.
+    """Return the key by which a candidate's cause is looked up in `Walk.probability`.
 
-    `at_any_time` for a cause of the whole session, as a model in which it comes or goes near
-    an end has it, too; else `identity`.
+    `identity` for a change in mid-session. For any other cause `at_any_time`, as it also counts
+    as present in models in which it begins or ends in mid-session.
     """
     return at_any_time(candidate) if candidate.changes is None else identity(candidate)
 
@@ -119,9 +119,10 @@ def _claims(candidate: Candidate) -> Identity:
 def at_other_moments(
     candidate: Candidate, context: Context, low: float, high: float
 ) -> list[Candidate]:
-    """Return the same cause at all gaps between configurations from `low` to `high`, s.
+    """Return the candidate's cause at every gap between configurations from `low` to `high`.
 
-    [] for a candidate of the whole session. Gaps count that overlap the interval.
+    In s since the first row; gaps count that overlap this interval. [] for a candidate that does
+    not happen at one moment.
     """
     between, changes = EFFECTS[candidate.name].between, EFFECTS[candidate.name].changes
     if candidate.changes is not None and changes is not None:
@@ -217,9 +218,10 @@ class Evaluated:
 
     @cached_property
     def members(self) -> list[tuple[Family, Candidate, IntArray, FloatArray]]:
-        """Members of the background's families: (family, candidate, indices of its weights, map).
+        """Members (candidates) of the background's families of random effects, with their weights.
 
-        Indices in `estimate`; the map leads from weights to parameters, (parameters, weights).
+        (family, member, indices of its weights in `estimate`, matrix that turns its weights into
+        its parameters, (parameters, weights)).
         """
         found = []
         for family in self.families:
@@ -232,7 +234,7 @@ class Evaluated:
 
     @cached_property
     def by_itself(self) -> dict[Candidate, float]:
-        """Log Bayes factor of each member of the background's families, by its weights only."""
+        """Log Bayes factor of each candidate in the background, for nonzero weights of its own."""
         return {
             member: self.log_factor(where, np.full(len(where), self.std[family.candidate]))
             for family, member, where, _ in self.members
@@ -240,10 +242,11 @@ class Evaluated:
 
     @cached_property
     def standing_out(self) -> dict[Candidate, float]:
-        """Probability that each member of the background's families is a cause, given the model.
+        """Probability that each candidate in the background is a cause, given the model.
 
-        The product of two: that its family is present, and that this one of its m causes is,
-        at prior odds of 1 to m. Members of one cause have the same.
+        The product of two: that its family of random effects is present, and that it stands out
+        as one of m causes of this family, at prior odds of 1 to m. Candidates with the same
+        `identity` are one cause and have the same probability.
         """
         found = {}
         for family in self.families:
@@ -298,10 +301,10 @@ def _has_few_poses(data: Residuals) -> bool:
 
 
 def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]:
-    """Return the families of random effects that models may have beside their single causes.
+    """Return the families of random effects that models may have in addition to single causes.
 
-    One for each kind of error. [] for a session of few poses, which tell only the variance of
-    the noise. Families of a single cause are left out, except free forms.
+    One for each kind of error. Families of one cause only are left out, except free forms
+    (splines). [] for a session of so few poses that it shows only the variance of the noise.
     """
     if _has_few_poses(data):
         return []
@@ -315,9 +318,9 @@ def background(data: Residuals, candidates: Sequence[Candidate]) -> list[Family]
 
 
 def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
-    """Return families of random effects, with each free form as a family of its own.
+    """Return families of random effects, those of free forms split into one for each member.
 
-    Free forms are penalised members, such as splines; other families are unchanged.
+    Free forms are members with a penalty, such as splines; other families are unchanged.
     """
     found = []
     for family in families:
@@ -335,8 +338,8 @@ def by_form(data: Residuals, families: Sequence[Family]) -> list[Family]:
 def log_price(families: Sequence[Family]) -> float:
     """Return the log prior odds of a background, a set of families of random effects.
 
-    log(`KIND_ODDS`) for each effect among them, except lengths and tilts; and for a free form
-    with a variance of its own what a single cause costs.
+    log(`KIND_ODDS`) for each effect among them, except lengths and tilts; for each family of one
+    free form, as made by `by_form`, also the log prior odds of a single cause.
     """
     forms = [family.members[0] for family in families if family.candidate.variant == ALONE]
     each = -sum(np.log(form.drawn_from * len(LEVELS_M)) for form in forms)
@@ -440,11 +443,12 @@ class Walk:
         return max((chain.best for chain in self.chains), key=lambda model: model.value)
 
     def _form_for_shapes(self) -> Evaluated | None:
-        """Return a model better than all so far, with a free form in place of its shapes.
+        """Return a model better than all so far, in which a free form replaces fixed shapes.
 
-        Shapes are blocks of effects with thousands of candidates (`Effect.many`) at the form's
-        place and driver, such as gear waves for a joint's error curve: a chain never leaves
-        several of them in one move. None if no exchange is better.
+        The free form is a spline with a variance of its own, such as a joint's error curve; the
+        shapes are blocks of effects with thousands of candidates (`Effect.many`) at its place and
+        driver, such as gear waves. A chain never leaves several of these in one move. None if no
+        such replacement is better.
         """
         start = best = self._best_found
         for form in self.by_form:
@@ -464,10 +468,11 @@ class Walk:
         return None if best is start else best
 
     def _pair_for_pair(self) -> Evaluated | None:
-        """Return a model better than all so far, with two of a chain's weak blocks exchanged.
+        """Return a model better than all so far, by exchanging two blocks of a chain's best model.
 
-        Two causes may be imitated by two others: single moves of a chain from these to those
-        lead through models that are too unlikely. None if no exchange is better.
+        Two of the blocks lost least are exchanged for two others, which may imitate them:
+        single moves of a chain would lead through models that are too unlikely. None if no
+        exchange is better.
         """
         found = []
         for best in [chain.best for chain in self.chains]:
@@ -490,9 +495,9 @@ class Walk:
         return better
 
     def _likeliest(self, state: State) -> list[tuple[int, int]]:
-        """Return (block, level) of the causes that gain most if added to a state, one block each.
+        """Return (block, level) of the causes that gain most if added to a state, best first.
 
-        At most `MOST_FIRST`, the most first.
+        For each cause (`identity`) its best block. At most `MOST_FIRST` causes.
         """
         gain = state.gains.max(axis=1)
         causes: dict[Identity, int] = {}
@@ -505,9 +510,10 @@ class Walk:
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
         """Add likely changes in mid-session to the pool; return models with the likeliest one.
 
-        For the best model of each chain, with its background and without a sensor's wander,
-        which follows any change: a change is likely if it nearly pays, added or in the place
-        of a block. ``changes``: candidates that begin or end at a moment.
+        ``changes``: candidates that begin or end at a moment. A change is likely if it nearly
+        raises the log posterior, added to the best model of a chain or in place of one of its
+        blocks. Each best model is tried with its background, and without the wander of sensors,
+        which imitates any change. [] if no change is likely.
         """
         blocks, found = blocks_of(self.data, changes), []
         for best in [chain.best for chain in self.chains] if blocks else []:
@@ -541,12 +547,12 @@ class Walk:
         return found
 
     def _refined(self) -> bool:
-        """Add candidates near those of the best model to the pool; return whether any was added.
+        """Add candidates near those of the best model to the pool; True if there are new ones.
 
-        Of a cause that happened at a moment: itself at the gaps between the moments tried
-        before and after it, and, in the gaps nearest to it, the changes of every cause that
-        may change. Of another cause: what `Effect.finer` yields. Standard deviations of
-        moments are set anew.
+        For a cause that happened at a moment: the same cause at the gaps between the moments
+        tried before and after it, and, in the gaps nearest to it, the changes of every cause
+        that may change. For another cause: those that `Effect.finer` yields. The standard
+        deviations of the moments are computed anew.
         """
         best = self._best_found
         context, tried = self.data.part, [block.candidate for block in self.pool.blocks]
@@ -639,9 +645,10 @@ class Walk:
         ]
 
     def _again(self, start: Evaluated) -> Evaluated:
-        """Fit the model of an earlier walk to these residuals, by the keys of its candidates.
+        """Fit the best model of an earlier walk to this walk's residuals.
 
-        Blocks that are not in the pool are left out; `empty` if it cannot be fitted.
+        ``start``: that model, whose blocks are found in the pool by the keys of their
+        candidates; blocks that are not in it are left out. `empty` if it cannot be fitted.
         """
         place, levels = self.pool.place, {}
         for candidate, level in start.blocks:
@@ -651,10 +658,11 @@ class Walk:
         return self.empty if again is None else again
 
     def _shown(self, found: Evaluated) -> Evaluated:
-        """Return a model without the families of random effects that are not worth their price.
+        """Return a model without the families of random effects whose evidence is too small.
 
-        By their Bayes factors. The less worth half of these is taken out at a time, and the
-        model fitted again: one of two that imitate each other stays.
+        Too small: a log Bayes factor of at most the price (`log_price`, at least `PRICE`). The
+        worse half of these is taken out at a time, and the model fitted again, so that one of
+        two families that imitate each other stays.
         """
         while True:
             worth = [
@@ -672,10 +680,11 @@ class Walk:
             found = fewer
 
     def _surface(self, noise: Noise, background: Mapping[Candidate, float]) -> Surface:
-        """Return the surface of a noise and a background, with all blocks of the pool.
+        """Return the surface for a noise and a background, with all blocks of the pool.
 
-        The last one if it is the same, else a new one in its memory: the last must not be used
-        any more. ``background``: prior std of the weights of each family of random effects, m.
+        ``background``: prior std of the weights of each family of random effects, m. It is the
+        last surface if that is for the same; else a new one that takes over the memory of the
+        last, which must not be used any more.
         """
         last = self._last_surface
         if last is None or not last.has(noise, background):
@@ -684,20 +693,21 @@ class Walk:
         return last
 
     def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
-        """Fit a model with the families of ``start``, at its own noise; None if it cannot be.
+        """Fit a model with the families of random effects of ``start``, at its own noise.
 
-        A model evaluated before is returned as it was.
+        The search for the noise begins at that of ``start``. None if it cannot be fitted. A
+        model evaluated before is not fitted again: that result is returned.
         """
         if model not in self._known:
             self._known[model] = evaluated(self.pool, start.families, model, start)
         return self._known[model]
 
     def _chain(self, current: Evaluated, hot: bool, before: Evaluated | None = None) -> Chain:
-        """Run a chain from a model in rounds, each at the noise and background of the best so far.
+        """Run a chain in rounds, each at the noise and background of the best model so far.
 
-        It ends if a round finds nothing better, also with the background chosen anew. ``hot``:
-        begin at a raised temperature; ``before``: earlier model whose noise and background the
-        first round has.
+        ``current``: model to begin at; ``hot``: begin at a raised temperature; ``before``:
+        earlier model whose noise and background the first round has. The chain ends if a round
+        finds nothing better, even with the families of the background chosen anew.
         """
         new_background = current is self.bare or before is not None
         for index in range(ROUNDS):
@@ -742,10 +752,12 @@ class Walk:
                 break
 
     def _whole(self, model: Model, start: Evaluated | None) -> Evaluated | None:
-        """Fit a model with its families of random effects chosen anew; None if not possible.
+        """Fit a model with the families of random effects of its background chosen anew.
 
-        The better of shared variances and one for each free form. ``start``: where the search
-        for noise begins; a model fitted before is returned as it was.
+        Tried are one variance for all free forms (splines) of an effect, and one for each of
+        them; the better is returned, without families of too little evidence. ``start``: where
+        the search for the noise begins. None if the model cannot be fitted. A model fitted here
+        before is not fitted again: that result is returned.
         """
         if model not in self._wholes:
             tried = [
@@ -757,11 +769,11 @@ class Walk:
         return self._wholes[model]
 
     def _refitted(self, model: Model, before: Evaluated, new_background: bool) -> Evaluated:
-        """Fit a model at its own noise, and add single causes that stand out of its background.
+        """Fit a model at its own noise, and move causes that stand out of its background to it.
 
-        These become blocks as long as that raises the log posterior. ``before`` is returned if
-        the model cannot be fitted; ``new_background``: choose the families of random effects
-        anew.
+        They become single causes (blocks) as long as that raises the log posterior.
+        ``before``: model with noise to begin at, and returned if ``model`` cannot be fitted;
+        ``new_background``: choose the families of random effects anew.
         """
         if new_background:
             best = self._whole(model, before)
@@ -864,8 +876,8 @@ class Walk:
     def log_gain(self, causes: Sequence[Candidate], share: float = 1.0) -> float:
         """Return the loss in log posterior of the best model by leaving out some of its causes.
 
-        ``causes``: candidates, of which at least one is in it; ``share``: of the readings that
-        count as independent, by which the Bayes factor is multiplied.
+        ``causes``: candidates, of which at least one is in it; ``share``: share of the readings
+        that are independent, by which the log Bayes factor is multiplied.
         """
         best, mine = self.models[0], {identity(candidate) for candidate in causes}
         wheres, stds, price = [], [], 0.0
@@ -926,10 +938,11 @@ class Walk:
 
     @cached_property
     def claimed(self) -> list[Candidate]:
-        """Candidates of `best` whose probability, with that of their look-alikes, is at least 1/2.
+        """Candidates of `best` that are reported: causes of a probability of at least 1/2.
 
-        Shapes that are part of a free form among them are left out, and weaker copies of a
-        cause by another axis.
+        The probability includes that of look-alikes. Left out are fixed shapes (such as gear
+        waves) that are part of a free form among them, and candidates of the same cause by
+        another axis that explain less.
         """
         found = []
         best = self.models[0]
@@ -956,9 +969,10 @@ class Walk:
         return found
 
     def _is_part(self, candidate: Candidate, form: Candidate) -> bool:
-        """Return whether a candidate of thousands (`Effect.many`) is part of a free form.
+        """Return whether a candidate, such as a gear wave, is part of a free form (a spline).
 
-        If it is one of its shapes, and the form reproduces nearly all of its displacement.
+        True if its effect has thousands of candidates (`Effect.many`), it is one of the form's
+        shapes, and the form reproduces nearly all of its displacement.
         """
         if not (EFFECTS[candidate.name].many and candidate.is_shape_of(form)):
             return False
@@ -972,8 +986,8 @@ class Walk:
     def instead_of(self, group: Sequence[Candidate]) -> dict[Candidate, float]:
         """Return candidates that other models have in place of some causes, with probabilities.
 
-        Those of models with none of the causes in ``group``, less candidates that the best
-        model has. {} if all models have one.
+        Counted are models without any cause of ``group``; of these, the candidates that the
+        best model does not have. {} if every model has a cause of the group.
         """
         mine = {_claims(candidate) for candidate in group}
         best = {identity(candidate) for candidate in self.named(self.models[0])}
@@ -990,9 +1004,10 @@ class Walk:
 
     @cached_property
     def probability(self) -> dict[Identity, float]:
-        """Probability of each cause that some model has, by `identity` and by `at_any_time`.
+        """Probability of each cause that some model has, by the keys `identity` and `at_any_time`.
 
-        As a block, or as a member of the background that stands out.
+        A cause counts as a single cause (block), or as a member of the background with its
+        probability of standing out.
         """
         found: dict[Identity, float] = {}
         for model, share in zip(self.models, self.share, strict=True):
@@ -1023,10 +1038,10 @@ class Walk:
         return [candidate for candidate, chance in self.present(model).items() if chance >= 0.5]
 
     def solution(self, model: Evaluated) -> Solution:
-        """Return a model as a solution: blocks and background in their candidates' parameters.
+        """Return a model as a solution, in the parameters of its candidates.
 
-        A cause that is both a block and a member of the background has the sum of both: its
-        size is not shrunk by the variance of its family.
+        The candidates are those of its blocks and of its background. Of one that is in both,
+        the parameters are the sum: its size is not shrunk by the variance of its family.
         """
         p = self.data.base.shape[2]
         mean, covariance = model.estimate

@@ -78,7 +78,8 @@ def p_value_text(p_value: float) -> str:
 def clock_time(stamp_s: float) -> str:
     """Return a time as text: '08:11:05 UTC on 2026-11-22'.
 
-    '' if it is not in this age, and so no time since 1970. ``stamp_s``: s since 1970.
+    ``stamp_s``: s since 1970. '' for a stamp that cannot be such a time, as it is far in the past
+    or future.
     """
     if not EARLIEST_S < stamp_s < LATEST_S:
         return ''
@@ -88,8 +89,9 @@ def clock_time(stamp_s: float) -> str:
 def titled(candidate: Candidate, joints: Sequence[int]) -> str:
     """Return a heading: 'Link length of joint 2', 'Joint 3 slipped', 'The sensor mocap moved'.
 
-    ``candidate``: the first of a cause; ``joints``: of the whole cause, 1-based, of which a
-    step or unnamed cause names the first. Of a change with its time.
+    ``candidate``: the first one of a cause; ``joints``: of the whole cause, 1-based; headings of
+    steps and of unnamed causes name only the first. The heading of a change in mid-session ends
+    with its time: ', from 12.0 min on'.
     """
     kind = KIND_OF_SUBJECT.get(candidate.place, '')
     joint = joint_words(joints[:1]) if joints else ''

@@ -88,7 +88,8 @@ class SessionOptions:
 
         `couple`: joint -> joint whose angle is added to its own, with a minus sign in front to
         subtract it; `reverse`: joints whose sign is reversed; `offset_deg`: joint -> angle to
-        be added, degrees. None or () for no such corrections.
+        be added, degrees. None or () for no such corrections. `sensor_kind`: kind of all
+        sensors, 'camera' or 'tracker', '' to derive it. Other options have their defaults.
         """
         added: dict[str, tuple[str, Literal[1, -1]]] = {
             name: (other.lstrip('+-'), -1 if other[:1] == '-' else 1)
@@ -176,8 +177,10 @@ def assemble(
     """Session from rows, and two sentences: how poses were found, and how rows were held out.
 
     Joint positions and torques are converted to those of the URDF. The limits, and whether the
-    table fits the robot, are not checked. Markers whose position is unknown are at the tip, with a
-    standard deviation of 0.3 m; others have 0.5 mm if none is stated. `rng`: draws held-out poses.
+    table fits the robot, are not checked. Markers whose position is unknown are at the tip,
+    with a standard deviation of 0.3 m; others have 0.5 mm if none is stated. `urdf`: text of
+    the URDF of `chain`; `rng`: draws held-out poses; `notes`: text for the session's field of
+    this name.
 
     Raises
     ------
@@ -255,8 +258,9 @@ def _kinds(
 ) -> dict[str, SensorKind]:
     """Kind of instrument ('camera' or 'tracker') by sensor name; unknown ones are left out.
 
-    That of the options; else by words in the sensor's name, if these are of one kind only;
-    else that of the file's format; else 'camera' if the sensor is on the tool.
+    The kind that the user stated (`options.sensor_kind`); else the one that words in the
+    sensor's name tell, if they tell one only; else that of the file's format
+    (`rows.instrument`); else 'camera' if the sensor is on the tool.
     """
     kinds: dict[str, SensorKind] = {}
     for name in sensors:
@@ -273,8 +277,9 @@ def with_controller_coupling(
 ) -> tuple[SessionOptions, list[str]]:
     """Options with the joint coupling of the controller that wrote the file, and a sentence on it.
 
-    The same options and [] if the file has no coupling, the user stated one, a joint slides,
-    or, with 12 rows or more, the points fit better without it (the URDF may contain it).
+    The same options and [] if the file's format has no coupling, the user stated one, or the
+    arm has a prismatic joint; also if there are 12 rows or more and the nominal arm fits the
+    points better without the coupling: the joints of the URDF are then coupled already.
     """
     coupling = tuple(rows.coupling.items())
     if options.couple or not coupling or chain.slides.any():
@@ -294,8 +299,9 @@ def with_controller_coupling(
 def without_whole_turns(session: Session, chain: SerialChain) -> tuple[Session, str]:
     """Session with joint angles (q and from_q) shifted by whole turns into the limits.
 
-    Last result: a sentence on the shifts; '', with the session as it is, if no q is shifted. A
-    shifted session has no `observations_sha256`, as its rows differ from its file.
+    Last result: a sentence on the shifts. If no angle of q needs a shift, the session is
+    returned as it is (from_q, too), with ''. A shifted session has no `observations_sha256`
+    (''), as its rows differ from its file.
     """
     m = session.measurements
     q = chain.within_turns(m.q)
@@ -384,11 +390,11 @@ def _frames(
     marker: IntArray,
     configuration: IntArray,
 ) -> IntArray | None:
-    """Index of the camera frame of each row, (n,): rows that a sensor measured at one time.
+    """Index of the camera frame of each row, (n,); -1 for a row that is alone in its frame.
 
-    -1 for a row that is alone in its frame. None if every row is alone, if `moment` is None,
-    or if a marker is in a frame twice. `moment`: time, s, or number of the reading of each
-    row, (n,); the others are indices, (n,).
+    Rows with the same sensor, configuration and `moment` are one frame. None if every row is
+    alone, if `moment` is None, or if a marker is in a frame twice. `moment`: time of each row,
+    s, or number of the reading that it is from, (n,); the other arguments are indices, (n,).
     """
     if moment is None:
         return None
@@ -402,9 +408,10 @@ def _frames(
 def _configurations(rows: RawRows, pose: IntArray, q: FloatArray) -> IntArray:
     """Index of the configuration of each row, (n,), from 0.
 
-    By the label ``configuration`` within a pose; else a new one begins where joints or pose
-    change, or where sensor and marker are the same as in the row before (so at each row
-    without such labels).
+    Rows with the same pose and the same label ``configuration`` are of one configuration, if
+    the table has such labels. Else a new one begins where a joint position or the pose
+    changes, or where sensor and marker are the same as in the row before; without labels of
+    sensors and markers each row is a new one.
     """
     if 'configuration' in rows.labels:
         labels = list(zip(pose.tolist(), rows.labels['configuration'], strict=True))

@@ -185,13 +185,13 @@ def read_streams(
     joint_topics, point_topics, length, links
         As of `read_bag`.
     names
-        Topic -> sensor and marker, if they are known.
+        Topic -> sensor and marker, if they are known; others are named by the topic.
 
     Returns
     -------
     Stream, list of MarkerStream, dict
-        Joint positions, rad, (n, k); positions of each marker, m; topic or name -> meaning in
-        words.
+        Joint positions, rad, (n, k); positions of each marker, m; and what each topic is used
+        as, a phrase such as 'marker sir of sensor mocap, m' or 'not used', by its name.
 
     Raises
     ------
@@ -417,12 +417,12 @@ class _Rows:
         self._matched: list[str] = []
 
     def add(self, topic: str, stream: Stream) -> None:
-        """Add the mean point of one topic at each standstill of the joints.
+        """Add a row for each standstill of the joints: the mean of the topic's points in it.
 
-        `stream`: points, m, or poses (n, 7). The first 0.5 s of a standstill are not used. One
-        without points is left out; so is one at which the marker was not still
-        (`standstills.reading_of`), and it is counted. Raises InputError if the offset between
-        the clocks is to be found and is not.
+        `stream`: points, m, or poses (n, 7). The first 0.5 s of a standstill are not used. A
+        standstill without points gives no row; nor does one at which the marker was not still
+        (`standstills.reading_of`), and a warning of `raw` states the number of these. Raises
+        InputError if the user stated no offset between the clocks, and none is found.
         """
         still = self._still
         if not len(still) or not len(stream.stamps):
@@ -454,8 +454,9 @@ class _Rows:
     def raw(self, topics: Sequence[str], length: str, seen: dict[str, str]) -> RawRows:
         """All rows, sorted by standstill and topic. Raises InputError if there are none.
 
-        `topics`: those with the points; `length`: name of the points' unit in the bag; `seen`:
-        topic -> type of the topics that are not used.
+        `topics`: those with the points; `length`: unit of the points in the bag, for the texts
+        only, as the rows are in m already; `seen`: topic -> type of the bag's topics, of which
+        those that are not used are listed, too.
         """
         path, chain, joint_topic = self._path, self._chain, self._joint_topic
         if not self._rows:

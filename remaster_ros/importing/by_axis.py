@@ -26,11 +26,12 @@ def wide(
 ) -> tuple[list[str], Rows, list[int]] | None:
     """Column names, rows and lines of a table with one row a point; None for other tables.
 
-    For a report with a row for each of X, Y and Z: at least 9 rows, over half of them of an
-    axis, the three of a point one below the other in this order. The name of the point comes
-    first; a column of numbers becomes three, ``name X`` and so on. `lines`: line of each row
-    in the file; the result has that of each point's X; `is_number`: whether a cell can be one
-    of a column of numbers.
+    For a report with a row for each of X, Y and Z: of its rows, at least 9, over half are for
+    an axis, and those of a point are one below the other in this order. The name of the point
+    comes first; a column ``name`` of numbers becomes three, ``name X`` and so on, other
+    columns are left out. `lines`: line of each row in the file; the result has that of each
+    point's X; `is_number`: whether a cell may stand in a column of numbers (is a number, or
+    empty).
 
     Raises
     ------

@@ -28,10 +28,11 @@ def rows_of(
 ) -> RawRows:
     """Rows of messages of robot_calibration, given as pairs of time of recording, s, and message.
 
-    The markers of a sensor are the places in its list of points, as a finder lists the corners of
-    a board. Points that stand still (extent below 2 % of the largest) come from the arm's own
-    model and are left out, as are points that are not finite. `sensors`: names of the sensors to
-    use, () for all; `length`: unit of the points, '' for m.
+    One for each marker that a sensor measured in a message. The i-th point in a sensor's list
+    is always the same marker, such as a corner of a board. Markers that hardly move over all
+    messages (extent up to 2 % of the largest) come from the arm's own model and are left out,
+    as are points that are not finite. `sensors`: names of the sensors to use, () for all;
+    `length`: unit of the points, '' for m.
 
     Raises
     ------

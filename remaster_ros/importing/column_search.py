@@ -95,8 +95,8 @@ def find_columns(
     joint_names
         Joints of the robot; a header that contains one of them is that joint's column.
     chosen
-        Columns that the user chose; those of a kind are ignored if the table lacks one of
-        them.
+        Columns that the user chose. If the table lacks one that was chosen for the joints, all
+        chosen for the joints are ignored, and the headers decide; likewise for the points.
     sliding
         Indices of prismatic joints, whose columns hold lengths.
 
@@ -252,11 +252,12 @@ def _single_set(
 def _joint_number(
     words: tuple[str, ...], named: Sequence[tuple[str, ...]]
 ) -> tuple[int | None, tuple[str, ...]]:
-    """Number of the joint that a header names, and the header's words with the joint replaced.
+    """Number of the joint that a header names, and the header's words with a mark in its place.
 
-    From 1 if a name of the robot is found, which becomes '=' (and its number beside it '#');
-    else the only number among several words, as written, which becomes '*'. None and () if
-    neither is there. `words`: of the header; `named`: words of each joint's name.
+    If the header contains the name of a joint of the robot, that joint's number, from 1: the
+    name becomes '=', and the same number beside it '#'. Else the only number in a header of
+    two words or more, as written; it becomes '*'. None and () if it has neither. `words`: of
+    the header; `named`: words of each joint's name, base to tip.
     """
     for i, name in sorted(enumerate(named), key=lambda pair: -len(pair[1])):
         for short in (name, name[:-1] if name[-1:] == ('joint',) else name):
@@ -278,11 +279,12 @@ def _joint_number(
 def _chosen_points(
     table: TextTable, headers: Sequence[Header], names: Sequence[str], found: Columns
 ) -> dict[str, tuple[int, ...]]:
-    """Columns X, Y, Z by marker, as the user named them with --points.
+    """Columns X, Y, Z by marker, as the user named them with --points; {} if the table lacks one.
 
-    `names`: markers, or columns, three for each marker. Notes the columns as ``told`` in
-    ``found.origin``; {} if this table does not have all of them. Raises InputError if the
-    number of columns is no multiple of three.
+    `names`: names of markers of this table; or else headers or numbers of columns, three for
+    each marker. The columns are noted as ``told`` in ``found.origin``, and quaternions of
+    named markers go into ``found.orientations``, in place. Raises InputError if a column is
+    named twice, or their number is no multiple of three.
     """
     groups = {name: table.groups[name] for name in table.groups} or {
         _marker_label(table, columns): columns for columns in _xyz_groups(headers, set()).values()

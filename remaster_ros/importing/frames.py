@@ -27,11 +27,11 @@ def is_frame(given: Any) -> bool:
 
 
 def tables_of(frames: Sequence[Any], names: Sequence[str]) -> list[TextTable]:
-    """Data frames as text tables, one each; `names` are theirs in messages.
+    """Data frames as text tables, one for each; `names`: what the tables are called in messages.
 
-    The index becomes a column, ``time`` or ``index``, unless that of each frame counts its
-    rows from 0 on. Raises InputError if there are several frames and one has the same index
-    label twice.
+    The index becomes a column, ``time`` or ``index``, unless the index of each frame just
+    counts its rows from 0 on. Raises InputError if there are several frames and one has the
+    same index label twice.
     """
     plain = all(_counts(frame) for frame in frames)
     for frame, name in zip(frames, names):

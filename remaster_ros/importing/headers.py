@@ -96,7 +96,8 @@ def with_axis(words: Sequence[str]) -> tuple[str, ...]:
     """Words of a header with each axis as a word of its own: 'p', 'x' for `px`, 'x' for `easting`.
 
     `px`, `posx`, `sx`, `dx`, `rx`, `tx` and `vx`, and the same of y and z, are split. Words
-    such as `grid` that only surveyed heights have are left out.
+    that surveyors put before a height only (`grid`, `ellipsoidal`, …) are dropped, so that the
+    headers of X, Y and Z differ in the axis alone.
     """
     words = [_AXIS_WORDS.get(word, word) for word in words if word not in _SURVEYED]
     split = (

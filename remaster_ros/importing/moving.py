@@ -138,8 +138,8 @@ class _Frames:
     def of(cls, streams: Sequence[MarkerStream], markers: Sequence[str]) -> _Frames:
         """Frames of a sensor from its markers' streams: positions with equal stamps are one frame.
 
-        ``streams``: of this sensor; ``markers``: names of all markers, whose indices the
-        frames have.
+        ``streams``: of this sensor; ``markers``: names of all markers of the recording; the
+        frames hold each marker's index in it.
         """
         stamps = np.unique(np.concatenate([stream.stream.stamps for stream in streams]))
         positions = np.full((len(stamps), len(streams), 3), np.nan)
@@ -152,10 +152,10 @@ class _Frames:
     def at_constant_rate(self) -> _Frames | None:
         """Same frames with stamps at a constant rate; None if the camera has no such rate.
 
-        Each frame gets a number, which counts the frames before it and those that were lost;
-        late frames (delayed on their way, for any time) keep theirs. None unless nine tenths
-        of the numbers are certain, and nine tenths of these frames are within half a period of
-        the constant rate. Frames without a certain number are left out.
+        Each frame gets a number, which counts the frames before it and those that were lost; a
+        delay on the way, however long, does not change a frame's number. None unless nine
+        tenths of the numbers are certain, and nine tenths of these frames are within half a
+        period of the constant rate. Frames without a certain number are left out.
         """
         stamps = self.stamps
         gaps = np.diff(stamps)
@@ -309,8 +309,9 @@ class _Recording:
         )
 
     def fitted(self, clocks_s: FloatArray, found: bool) -> tuple[FloatArray, _Guess, float]:
-        """Clock offset of each sensor, s, (sensors,), robust fit, and its median error, m.
+        """Clock offset of each sensor, s, (sensors,), robust fit, and median residual, m.
 
+        The residual is the distance of the measured from the fitted positions of markers.
         ``clocks_s``: offsets to begin with; ``found``: whether to improve them, in up to 12
         steps until all steps are below 20 µs, else they are returned as given. Raises
         InputError as `session`.
@@ -685,7 +686,7 @@ def _means(
 
 
 def _joined(parts: Sequence[Measurements]) -> Measurements:
-    """Rows of all parts in the order of time, sensor and marker, with new numbers from 0."""
+    """Rows of all parts by time, sensor and marker, their observations numbered anew from 0."""
     columns = {
         name: None
         if getattr(parts[0], name) is None
@@ -696,7 +697,7 @@ def _joined(parts: Sequence[Measurements]) -> Measurements:
 
 
 def _in_order(measurements: Measurements) -> Measurements:
-    """Rows in the order of time, sensor and marker, with new observation numbers from 0."""
+    """Rows by time, sensor and marker, their observations numbered anew from 0."""
     order = np.lexsort((measurements.marker, measurements.sensor, measurements.stamp_s))
     return replace(measurements.select(order), observation=np.arange(len(measurements)))
 
@@ -747,9 +748,11 @@ def _clock_by_speeds(
 
 
 def _robust_fit(session: Session) -> tuple[_Guess, FloatArray, float]:
-    """Robust fit of a session, remaining offset of each sensor's clock, s, and median error, m.
+    """Robust fit of a session, remaining offset of each sensor's clock, s, and median residual, m.
 
-    The offsets, (sensors,), are to be added to the stamps. At most 1,500 rows to fit are used.
+    The offsets, (sensors,), are to be added to the stamps; the residual is the distance of the
+    measured from the fitted positions. At most 1,500 of the rows that are not held out are
+    used.
     """
     problem = Problem.of(session)
     measurements, rows = problem.measurements, problem.fitted

@@ -152,9 +152,11 @@ def _readings(points: Table, modelled: FloatArray, stated_unit: str) -> _Reading
 
 
 def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray) -> None:
-    """Raise InputError for a point with only some of X, Y, Z, or if several markers have no point.
+    """Raise InputError for the first point that has some of X, Y and Z, but not all three.
 
-    `raw`: points by marker, NaN where empty, (markers, n, 3).
+    Also if there are several markers, and none of them has a point in any row. Rows in which
+    all three are empty are valid. `raw`: points by marker, NaN where empty, (markers, n, 3);
+    `columns`: has the columns of each marker in `table`.
     """
     for marker_columns, points in zip(columns.points.values(), raw):
         empty = np.isnan(points)
@@ -171,9 +173,11 @@ def _refuse_part_of_a_point(table: TextTable, columns: Columns, raw: FloatArray)
 def _markers_on_arm(
     raw: FloatArray, names: Sequence[str], table: TextTable
 ) -> tuple[BoolArray, tuple[str, ...]]:
-    """Mask of the markers that move with the arm, (markers,), as `moving_markers`.
+    """Mask of the markers that move with the arm, (markers,), by `moving_markers`.
 
-    Last result: a sentence on each other marker, whether unmoved or never seen.
+    Last result: a sentence on each other marker, whether unmoved or never seen. `raw`: points
+    by marker, NaN where empty, (markers, n, 3); `names`: of the markers; `table`: for the
+    sentences.
     """
     moved = moving_markers(raw)
     return moved, tuple(
@@ -304,8 +308,9 @@ def _optional_column(points: Table, kind: str) -> FloatArray:
 def _labels(pair: PairedTables, readings: _Readings) -> dict[str, list[str]]:
     """Label of each reading by kind: pose, configuration, split, sensor, marker.
 
-    Only kinds that have a column, in the points' table or else in the joints'. Of several
-    markers their names are the kind 'marker'.
+    Only kinds that have a column, in the points' table or else in the joints'. If the points'
+    table has columns of several markers, the label 'marker' is the name of the reading's
+    marker.
     """
     given: dict[str, list[str]] = {}
     for kind in _OTHERS:

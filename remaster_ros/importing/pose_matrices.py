@@ -25,9 +25,10 @@ _COUNTED = re.compile(r'(.*?)[\[(_ ]*(\d{1,2})[\])]?')
 def with_poses(table: TextTable) -> TextTable:
     """Table with X, Y, Z and quaternion in place of the sixteen columns of each 4×4 matrix.
 
-    The seven columns, named ``pose x`` to ``pose qw`` by the matrix's name, are in `groups`
-    and `turns` of the result. Sixteen columns of which a row is no rigid motion stay as they
-    are; a table without matrices is returned unchanged.
+    The seven columns are named ``pose x`` to ``pose qw``, with the matrix's name for ``pose``.
+    By that name `groups` of the result has the columns of the point, `turns` those of the
+    quaternion. Sixteen columns of which a row is no rigid motion stay as they are; a table
+    without matrices is returned unchanged.
     """
     names, rows = list(table.names), [list(row) for row in table.rows]
     dropped: set[int] = set()
@@ -65,8 +66,9 @@ def with_poses(table: TextTable) -> TextTable:
 def _matrices_by_name(table: TextTable) -> Mapping[str, list[int]]:
     """Sixteen column indices of each 4×4 matrix, by the matrix's name in the headers.
 
-    In the order of row and column, or of one count; both begin with 0 or 1 in the headers. {}
-    if there are none.
+    The headers have the name and then row and column of the element, or only its number from 0
+    to 15; all may count from 1 instead. The indices are in the order of rows, or of the
+    numbers. {} if there is no such matrix.
     """
     found: dict[str, list[int]] = {}
     for pattern, counts in ((_ROW_AND_COLUMN, SIZE), (_COUNTED, COUNT)):

@@ -199,9 +199,9 @@ def _at_standstills(
 ) -> PairedTables | None:
     """Tables of the means at standstills, if the joints are a stream; None if they are not.
 
-    None also if the rows are to be joined: the user chose names or times for it, or no times,
-    or both tables share names; but not if a clock offset is stated. Raises InputError as
-    `stopped`.
+    None also if rows are to be joined instead, unless the user stated a clock offset: if the
+    user asked to join by name or time, or not to use times, or if two tables have names in
+    common (and the user did not ask to join by order). Raises InputError as `stopped`.
     """
     points, joints = pair.points, pair.joints
     in_order = options.join == 'order'

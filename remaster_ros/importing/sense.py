@@ -218,9 +218,10 @@ def _too_few(session: Session, joints: int) -> str:
 
 
 def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sense | None:
-    """Finding that markers fit when each is fitted alone, though not together; None if none does.
+    """Finding that some markers fit when each is fitted alone, though not all together.
 
-    The result does not fit; its options name the first such marker. `error_text`: error of the
+    None if no marker fits alone. In the result `fits` is False, and `options` is the --points
+    with the columns of the first marker that fits ('' if unknown). `error_text`: error of the
     fit of all markers, for the sentence.
     """
     m = session.measurements
@@ -253,7 +254,8 @@ def _single_markers_fit(session: Session, rows: RawRows, error_text: str) -> Sen
 def _outlying_rows(session: Session, off: RowsOff, rows: RawRows) -> tuple[tuple[str, float], ...]:
     """Rows of the table that do not fit: file and line, and distance, m, the farthest first.
 
-    Those that `off` has as gross errors and that are over 10 mm (`BENT_M`) from the fit.
+    Those that `off` marks as gross errors of the fit (`off.off`) and that are over 10 mm
+    (`BENT_M`) from it. `rows`: all rows of the table, for file and line.
     """
     found = np.flatnonzero(off.off & (off.error_m > BENT_M))
     order = found[np.argsort(-off.error_m[found], kind='stable')]

@@ -20,7 +20,10 @@ QUARTER_DEG = 90.0
 
 @dataclass(frozen=True)
 class Stretch:
-    """A change of the observations from number `since` to before `until`; None: no such bound."""
+    """A change of the observations from number `since` to before `until`; None: no such bound.
+
+    `what`: the change as text: a number of rows, or the names of two markers.
+    """
 
     what: str
     since: int | None = None
@@ -113,8 +116,9 @@ def arrangement_of(
 def corrected_session(session: Session, arrangement: Arrangement) -> Session:
     """Session with a correction applied to all its rows, reference visits included.
 
-    The session itself if the arrangement changes nothing. Raises InputError if a joint is to
-    be coupled whose controller has it coupled or moved already.
+    The session itself if the arrangement changes nothing. Raises InputError if joint 3 is to
+    be coupled to joint 2, and the session's controller couples one of them already, or counts
+    joint 2 from another zero than the URDF.
     """
     if arrangement == Arrangement.given(len(arrangement.order)):
         return session
@@ -140,8 +144,8 @@ def _controller(
     """Unit, sign, zero and coupling by which the controller counts each joint, after a correction.
 
     The session's own controller (or None) if the arrangement leaves the joints as they are.
-    Raises InputError for --couple if one of the two joints is coupled already, or the second
-    has a zero of its own.
+    Raises InputError if the arrangement couples joint 3 to joint 2, and one of them is coupled
+    already, or the controller counts joint 2 from another zero than the URDF.
     """
     plain = Arrangement.given(len(joint_names))
     of_joints = (arrangement.order, arrangement.signs, arrangement.quarters, arrangement.coupled)

@@ -78,11 +78,12 @@ def match(
 ) -> Matching:
     """Pair the standstills of points with those of the joints (mean: rad, (n, k)).
 
-    `names`: of the streams of points and of joints, for messages. `offset_s`: added to the
-    points' times to have the joints', s; None to find the best of many, of equal clocks, and
-    of pairs by order if both are equally many. The best has pairs that the robot fits to 15 %
-    of the points' extent, if there are 11 or more, else the most pairs. Raises InputError if
-    nothing stood still, no offset joins them, or several do equally well.
+    `names`: of the streams of points and of joints, for messages. `offset_s`: clock offset, s,
+    added to the points' times to have the joints'; None to choose among 0, the offsets that
+    bring most standstills together and, if both are equally many, pairing by order. Chosen is
+    what the robot fits to 15 % of the points' extent, tested with 11 pairs or more; if nothing
+    does, the offset with most pairs, where 0 needs half as many. Raises InputError if nothing
+    stood still, no offset gives pairs, or several give as many and the robot fits none.
     """
 
     def error_of(i: IntArray, j: IntArray) -> float:
@@ -166,11 +167,12 @@ def _matching(
 ) -> Matching:
     """Pairs of standstills that overlap with a clock offset, and the refined offset, s.
 
-    `offset`: added to the points' times, s. Each standstill of the joints gets the one of
-    points with which it shares most time, over half of the shorter one's; or all single shots
-    that fall into it. ``apart_s`` is the median difference of begins and ends after the
-    refined offset, None for shots. No pairs if none overlap. `error_of`: residual of the robot
-    for index arrays of pairs.
+    `offset`: added to the points' times, s. Each standstill of the joints is paired with the
+    standstill of points with which it shares most time, which must be over half of the shorter
+    one; or with all single shots that fall into it. ``apart_s`` of the result is the median
+    difference of begins and ends after the refined offset, None for shots. The result has no
+    pairs if none overlap. `error_of`: function of the index arrays of points and joints:
+    residual of the robot.
     """
     begin, end = points.begin + offset, points.end + offset
     before = np.searchsorted(joints.end, begin)
@@ -253,8 +255,8 @@ def _offsets(points: Standstills, joints: Standstills) -> list[float]:
 def _offsets_of_shots(shots: FloatArray, joints: Standstills) -> list[float]:
     """Clock offsets, s, with which most single shots fall into standstills of the joints.
 
-    The likeliest first, 60 at most; each is the middle of a range. `shots`: their times, s,
-    (n,).
+    Those with most shots first, 60 at most. The number of shots is constant over a range of
+    offsets; each result is the middle of such a range. `shots`: their times, s, (n,).
     """
     starts = (joints.begin[None] - shots[:, None]).ravel()
     stops = (joints.end[None] - shots[:, None]).ravel()

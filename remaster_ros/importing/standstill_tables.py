@@ -58,10 +58,10 @@ def stopped(
     """Tables with one row a standstill if the joints are a stream; None if they are not.
 
     `angles`, `length`: units that the user stated, '' if none; `clock_offset_s`: added to the
-    points' times to have the joints', None to find it. `in_order`: pair points with standstills by
-    their order, as the user said; None also if the rows are then equally many. Raises InputError
-    for a stream that never stands still, standstills that do not match, no point at one, or a
-    prismatic joint.
+    points' times to have the joints', None to find it. `in_order`: the user asked to pair
+    points and standstills by their order; None also if then both tables have equally many
+    rows, or are one and the same. Raises InputError for a stream that never stands still,
+    standstills that do not match, no point at any standstill, or a prismatic joint.
     """
     reported = times(*joints)
     if reported is None or not is_stream(reported):

@@ -88,7 +88,8 @@ class Standstills:
     def of_shots(cls, stamps: FloatArray, values: FloatArray) -> Standstills:
         """Single measurements of an instrument, each taken while the arm stood still.
 
-        `stamps`: s, (n,); `values`: (n, m). Motion before and after counts as unseen.
+        `stamps`: s, (n,), begin and end of each; `values`: (n, m), the means. They are marked
+        as neither `opened` nor `closed`: no motion before or after them was recorded.
         """
         none = np.zeros(len(stamps), bool)
         return cls(stamps, stamps, values, none, none)
@@ -216,10 +217,11 @@ def mean_of(rows: FloatArray) -> FloatArray:
 def reading_of(points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray] | None:
     """Mean (3,) and standard deviation (3,) of a marker at a standstill.
 
-    Last result: indices of the points used. `points` are in m, (n, 3), at least one. Of fewer than
-    five the last is taken, with NaN as deviation. None if the marker was not still: over a tenth
-    of the points (and more than one) are far from the median, or the deviation along an axis is
-    over 0.5 mm.
+    Last result: indices of the points used. `points` are in m, (n, 3), at least one. Of fewer
+    than five the last is taken, with NaN as deviation. Else outliers, far from the median
+    point compared with the median distance (`of_the_marker`), are not used. None if the marker
+    was not still: over a tenth of the points (and more than one) are outliers, or the
+    deviation along an axis is over 0.5 mm.
     """
     if len(points) < FEWEST_SAMPLES:
         # Shots of an instrument: the last one is the one that was kept.

@@ -71,7 +71,7 @@ def points_and_joints(tables: Sequence[TextTable], found: list[Table]) -> tuple[
 def unused_points(found: list[Table], used: TextTable) -> list[str]:
     """Sentences on the points of tables other than `used`, which has the points that are used.
 
-    Only tables with columns that the user chose, if there are such.
+    If the user chose columns of points in some of the tables `found`, only on those tables.
     """
     return [
         f'{table.path}: {", ".join(table.names[i] for i in columns.point)} left out, the points '
@@ -152,7 +152,10 @@ def _expanded_range(name: str) -> list[str]:
 
 
 def _refuse_absent_columns(found: list[Table], chosen: ColumnChoice) -> None:
-    """Raise InputError if a column that the user chose is in no table; ``none`` is no column."""
+    """Raise InputError if columns that the user chose were found in none of the tables `found`.
+
+    ``none`` for times or names means no column, and is accepted.
+    """
     for option, names, attribute in (
         ('--joints', chosen.joints, 'joints'),
         ('--points', chosen.points, 'point'),

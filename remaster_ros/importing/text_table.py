@@ -370,7 +370,7 @@ def _table(
 
 
 def _bounded(table: TextTable) -> TextTable:
-    """The table, unchanged.
+    """Return the table, unchanged, if its columns are not too many, nor their names too long.
 
     Raises InputError for over 5000 columns, or a name of over 1000 characters.
     """
@@ -474,9 +474,9 @@ def _with_lists_as_columns(
 ) -> list[tuple[int, str, list[str]]]:
     """Lines of a table with each list in a cell split into a cell for each number.
 
-    A line is its number, text and cells. The first line with lists decides on their lengths; a
-    missing list becomes empty cells, a name ``name x`` to ``name z`` for three numbers, else
-    ``name 1`` and so on.
+    A line is its number, text and cells. The first line with lists tells which columns are
+    lists, and of how many numbers. In these a missing list becomes empty cells, and the header
+    ``name`` becomes ``name x`` to ``name z`` for three numbers, else ``name 1`` and so on.
     """
     first = next((cells for *_, cells in split[:SEEN_LINES] if any(map(_list_in_cell, cells))), [])
     widths = [len(_list_in_cell(cell)) for cell in first]
@@ -543,9 +543,10 @@ def _without_units(
 
 
 def _find_separator(lines: Sequence[str]) -> str:
-    """Separator that gives most cells with numbers in rows of the usual width; ' ' if none does.
+    """Separator that gives most numbers in lines of the commonest number of cells.
 
-    An earlier one of `SEPARATORS` is kept unless a later one gives over 1.25 times as many.
+    An earlier one of `SEPARATORS` is kept unless a later one gives over 1.25 times as many. '
+    ' if none gives lines with two numbers.
     """
     best, most = ' ', 0
     for separator in SEPARATORS:
@@ -587,10 +588,11 @@ def _is_row(cells: Sequence[str]) -> bool:
 
 
 def _is_no_row(cells: Sequence[str], usual: IntArray, width: int) -> bool:
-    """Whether a line below the header is a sum, a page title or a remark, not a damaged row.
+    """Whether a line below the header is no row, but a sum, a page title or a remark.
 
-    `usual`: indices of the columns that have numbers in most rows, in which a row that was cut
-    off still has some numbers; False if there are none. `width`: number of columns.
+    False for damaged rows, which are to be refused: a row that was cut off still has a number
+    in one of the columns `usual` (indices of those with numbers in most rows). False, too, if
+    `usual` is empty. `width`: number of columns.
     """
     if not len(usual):
         return False
@@ -613,8 +615,9 @@ def _first_row(
     """Number of columns, index of the first row, and indices of the usual columns of numbers.
 
     The number of columns is that of most lines with two numbers; usual columns have numbers in
-    most of these. `split`: lines (number, text, cells). Raises InputError if no line has two
-    numbers.
+    most of these. `split`: lines (number, text, cells); `comment`: pattern at the begin of
+    comment lines, which are no rows; `path`: for messages. Raises InputError if no line has
+    two numbers.
     """
     rows = [
         (i, cells)
@@ -639,11 +642,15 @@ def _first_row(
 def _header(
     above: list[tuple[int, str, list[str]]], width: int, separator: str, path: Path
 ) -> tuple[list[str], str, int]:
-    """Names of the columns ([] if there are none), title lines, and index of the line behind them.
+    """Names of the columns, title lines, and index of the first line below the names.
 
-    The index is 0 if there are no names. `above` are the lines before the first row. A line of
-    units below the names is put into them in brackets. Raises InputError if over half of such
-    a line are units, but not all.
+    `above`: lines (number, text, cells) before the first row of numbers; the index counts in
+    it. The names are the lowest line with `width` cells (number of columns), also in a
+    comment; cells of a line above them are put before names that occur twice. A line of units
+    below the names is put into them in brackets, and the index is that of the line below it.
+    Title lines are the other lines as one text. [] and index 0 if there are no names. Raises
+    InputError if over half of the cells of a line below the names are units, but not all.
+    `path`: for messages.
     """
     names: list[str] = []
     over: list[str] = []

@@ -170,9 +170,10 @@ def _orientation_error(
     """Median difference of measured orientations from those of the nominal arm, rad.
 
     `xyzw`: quaternions, (n, 4), NaN if unknown; `arms`: tool poses, (n, 4, 4), for each way to
-    count the joints, of which the best counts. inf with fewer than 8 rows (`FEWEST_ROWS`) or,
-    unless `ignore_points`, if the sensor's orientation by these differs from that by the
-    points by over 0.2 rad.
+    count the joints, of which the one with the least difference counts. `on_tool`: whether the
+    sensor is on the tool. inf with fewer than 8 rows (`FEWEST_ROWS`) or, unless
+    `ignore_points`, if the sensor's rotation in the base frame as fitted to the orientations
+    is over 0.2 rad from the one fitted to the points.
     """
     known = np.flatnonzero(np.isfinite(xyzw).all(axis=1))
     if len(known) < FEWEST_ROWS:

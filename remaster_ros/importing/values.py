@@ -284,7 +284,10 @@ def _time(text: str, decimal: str, day_first: bool) -> float | None:
 
 
 def _in_english(text: str) -> str:
-    """Text of a date and time with English months, without days of the week, and with colons."""
+    """Text of a date and time in a form that `_time` reads.
+
+    Names of months in English, no days of the week, colons between hours, minutes and seconds.
+    """
     text = _WORD.sub(lambda word: _MONTHS.get(word[1].casefold(), word[0]), text)
     text = re.sub(r'[年月]', '-', text).replace('日', ' ').replace('_', ' ')
     text = re.sub(r'([AaPp])\. ?([Mm])\.', r'\1\2', text)
@@ -293,19 +296,20 @@ def _in_english(text: str) -> str:
 
 
 def _are_clocks(texts: Sequence[str]) -> bool:
-    """Whether times of day are written with points, such as 14.30.05, in all cells.
+    """Whether all cells are times of day that are written with points, such as 14.30.05.
 
-    A second number above 12, or 0, somewhere shows that they are no dates.
+    They could be dates (day.month.year): False unless in some cell the second number is 0 or
+    above 12, and so no month.
     """
     found = [_CLOCK.fullmatch(text) for text in texts]
     return all(found) and any(not 0 < int(match[2]) <= _MOST_MONTHS for match in found if match)
 
 
 def _is_day_first(texts: Sequence[str]) -> bool:
-    """Whether dates have the day before the month, judged from the whole column.
+    """Whether dates such as 3/11/2025 have the day before the month, judged from the whole column.
 
-    So if they have points, if a first number is above 12, or if the first changes and the second
-    does not.
+    True if a date has points (3.11.2025), if a first number is above 12, or if the first
+    numbers differ and the second ones do not, as days pass in a session, but no months.
     """
     found = [match for match in map(_DATE.match, texts) if match]
     first, second = [int(match[1]) for match in found], [int(match[3]) for match in found]

@@ -25,14 +25,14 @@ _HAND_BEHIND = 5
 def likely_base(model: UrdfModel, names: Container[str] = ()) -> str:
     """Return the likely base link of the arm: the robot's root, with two exceptions.
 
-    If the chain with the most joints (with ``names``: most of these) hangs on a joint that is
-    not the arm's (a rail or a lift with five or more revolute joints behind it, or a floating
-    or planar joint): the link behind that joint, or, if names of links from there to the arm's
-    first joint contain 'base', the shortest of these. If the root is a world frame (`_WORLD`)
-    with one link fixed to it: that link.
+    The arm is the chain with the most joints (first, with most of ``names``). If it hangs on a
+    joint that is not the arm's (a rail or a lift with five or more revolute joints behind it,
+    or a floating or planar joint): the link behind that joint, or, if names of links from
+    there to the arm's first joint contain 'base', the shortest of these. If not, and the root
+    is a world frame (`_WORLD`) with one link fixed to it: that link.
 
-    ``names``: joints that are known to be the arm's, as in `likely_tips`; a prismatic joint
-    among them is part of the arm, any other is not.
+    ``names``: joints that are known to be the arm's, as in `likely_tips`; if it has any, a
+    prismatic joint is part of the arm only if it is among them.
     """
     sliders = _sliders(model, names, carrying=False)
     arms = {
@@ -154,9 +154,11 @@ def moving_before(model: UrdfModel, base_link: str) -> list[str]:
 def _sliders(model: UrdfModel, names: Container[str], *, carrying: bool) -> set[str]:
     """Return the names of the prismatic joints that likely belong to the arm.
 
-    ``names``: if it has joints of the robot, the prismatic ones among them are returned. Else
-    mimic joints, jaws, and joints behind `_HAND_BEHIND` revolute ones that carry none are left
-    out. ``carrying``: whether a joint that carries an arm of that many revolute joints counts.
+    ``names``: joints known to be the arm's; if the robot has any of them, the prismatic ones
+    among them are returned. Else mimic joints and joints of gripper jaws are left out, and
+    those behind five revolute ones (`_HAND_BEHIND`) with no revolute one behind them.
+    ``carrying``: whether a joint with five or more revolute joints behind it (a rail) is
+    returned, too.
     """
     joints = model.parent_joint.values()
     named = [joint for joint in joints if joint.kind != 'fixed' and joint.name in names]
@@ -239,9 +241,10 @@ def _moved_from(model: UrdfModel, link: str) -> list[UrdfJoint]:
 
 
 def _is_jaw(joint: UrdfJoint) -> bool:
-    """Whether a joint moves a part of a gripper, by its name or its child's (`_JAWS`, ``grip``).
+    """Return whether a joint moves a part of a gripper, by its name.
 
-    A name with ``grip`` and a word for turning the whole gripper (`_WHOLE`) is none.
+    True if its name or its child link's has a word for such a part (`_JAWS`), or its name has
+    'grip', but no word for a joint that turns the whole gripper (`_WHOLE`).
     """
     name = joint.name.lower()
     if any(word in part for word in _JAWS for part in (name, joint.child.lower())):

@@ -212,8 +212,9 @@ def triangles(points: FloatArray) -> IntArray:
 def enclosing_points(points: FloatArray) -> FloatArray:
     """Return at most `_MOST_POINTS` points whose hull contains the points (n, 3).
 
-    The corners of their hull, or of their bounding box if these are more; up to 8 points, or
-    points in one plane, as they are.
+    The vertices of their convex hull; the 8 corners of their bounding box if there are more
+    vertices than that. Up to 8 points are returned as they are; of points in one plane, all
+    count as vertices.
     """
     if len(points) > 8:
         with suppress(QhullError):  # all in one plane: kept as they are

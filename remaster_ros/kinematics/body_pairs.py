@@ -164,9 +164,10 @@ class BodyPairs:
     def _apply_rule(self) -> None:
         """Remove pairs that overlap by construction; check those always near for contact only.
 
-        Over `_SAMPLES` random configurations: removed is a pair that overlaps in 95 % of them
-        (`_MOST`), with floor or obstacle in all. Checked for contact only is one that is nearer
-        than its clearance plus `RESERVE_M` as often. Each such pair gets a line in `left_out`.
+        Over `_SAMPLES` random configurations: a pair is removed if it overlaps in 95 % of them
+        (`_MOST`), and checked for contact only if it is nearer than its clearance plus
+        `RESERVE_M` in 95 %; for a pair with floor or obstacle in all instead of 95 %. Each
+        such pair gets a line in `left_out`.
         """
         low = np.where(np.isfinite(self.chain.lower), self.chain.lower, -np.pi)
         high = np.where(np.isfinite(self.chain.upper), self.chain.upper, np.pi)
@@ -328,10 +329,11 @@ class BodyPairs:
     ) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
         """Return possible violations: configuration, pair, clearance, whether certain, (c,) each.
 
-        Configurations and pairs are indices. Distances that need no coal are computed at once
-        and written into `bounds`, and only violations of these are returned, as certain.
-        ``bounds``: of `lower_bounds`, (n, P); ``is_open``: mask of the pairs to consider, (n,
-        P), None for all; ``extra``: added to the clearance, m.
+        Configurations and pairs are indices. A violation is certain if the distance is exact
+        without coal (`measure_cheap`; such distances are written into `bounds`); the others
+        are nearer than the clearance by their lower bound only. ``bounds``: of `lower_bounds`,
+        (n, P); ``is_open``: mask of the pairs to consider, (n, P), None for all; ``extra``:
+        added to the clearance, m.
         """
         on_top = self.on_top(extra)
         may = bounds < self.most_kept + on_top

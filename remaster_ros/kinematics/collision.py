@@ -260,7 +260,8 @@ class CollisionModel:
     def hides(self, q: ArrayLike, marker_T: ArrayLike, sensor_R: ArrayLike) -> BoolArray:
         """Return whether a link of the arm hides a marker from a sensor, (...).
 
-        Arguments as of `LinkCapsules.hides`.
+        ``q``: joint angles, rad, (..., k); ``marker_T``: marker in the tool frame, m, (3,);
+        ``sensor_R``: the sensor's origin in R, m, (3,).
         """
         return self._sight.hides(q, marker_T, sensor_R)
 

@@ -41,7 +41,7 @@ class ConvexDistances:
 
     @cached_property
     def _objects(self) -> list[tuple[Any, FloatArray]]:
-        """Coal's object of each shape and its pose in the frame of T, (4, 4), made once."""
+        """Coal's object of each shape, and its pose in the frame that carries it, (4, 4)."""
         return [self._object(shape, T) for shape, T in self._shapes]
 
     @cached_property
@@ -72,7 +72,10 @@ class ConvexDistances:
         )
 
     def _object(self, shape: Shape, T: FloatArray) -> tuple[Any, FloatArray]:
-        """Return coal's object of a shape, and the object's pose in the frame of T, (4, 4)."""
+        """Return coal's object of a shape, and its pose in the frame that carries it, (4, 4).
+
+        ``T``: pose of the shape in that frame, (4, 4).
+        """
         coal = self._coal
         if shape.kind == 'box':
             return coal.Box(*(shape.points.max(axis=0) * 2).tolist()), T

@@ -183,8 +183,8 @@ class _Search:
     def _extend(self, tree: list[_Node], goal: FloatArray) -> _Node | None:
         """Grow a tree one step towards a configuration; return the new node, None if blocked.
 
-        From its nearest node, by `REACH_RAD` at most, or to the configuration itself. The new node
-        is added to ``tree``; the largest joint counts as distance.
+        From its nearest node, by `REACH_RAD` at most, or to the configuration itself. The new
+        node is added to ``tree``; distance is the largest difference of a joint.
         """
         ways = np.abs(np.array([node.q for node in tree]) - goal)
         distances = np.max(ways / self._model.chain.per_radian, axis=1)
@@ -291,10 +291,10 @@ def way_out(
 
 
 def _fewest_lines(model: CollisionModel, way: FloatArray) -> FloatArray:
-    """Return an escape path (m, k) through as few of the waypoints of one, (n, k), as found.
+    """Return an escape path (m, k) through some of the waypoints of a given one, ``way``, (n, k).
 
-    The ends are kept, and each straight line between waypoints is an escape again. The arm comes
-    to rest at each waypoint.
+    As few as a greedy search finds: both ends are kept, and each straight line between
+    waypoints is an escape again. The arm comes to rest at each waypoint.
     """
     kept, corner, last = [way[0]], 0, len(way) - 1
     while corner < last:

@@ -235,7 +235,8 @@ class InverseKinematics:
     def difference(self) -> tuple[float, float] | None:
         """Largest difference at the tool to the nearest arm with a closed form, m and rad.
 
-        None if there is no such arm for some held values.
+        The largest over all combinations of held values. None if there is no such arm for some
+        of them.
         """
         found = [part for _, part in self._parts if part is not None]
         if len(found) < len(self._parts):
@@ -245,7 +246,8 @@ class InverseKinematics:
     def in_words(self) -> str:
         """Return sentences on how solutions are found, and how complete they are.
 
-        Without a closed form near this arm they need a trial of many starts (`missed_solutions`).
+        If no arm with a closed form is near this one, computing the sentences takes a trial of
+        many starts, some seconds (`missed_solutions`).
         """
         within = 'each is kept where forward kinematics reaches the pose to 1e-8 m and 1e-8 rad'
         if self.difference is not None:

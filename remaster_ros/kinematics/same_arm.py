@@ -112,14 +112,17 @@ def _axes(chain: SerialChain, from_base: bool) -> tuple[FloatArray, FloatArray]:
 
 
 def _tip(chain: SerialChain, from_base: bool) -> FloatArray:
-    """Return the tip frame with all joints at zero, (4, 4); reference frame as of `_axes`."""
+    """Return the pose of the tip with all joints at zero, (4, 4).
+
+    In the base frame if ``from_base``, else in that of the first joint.
+    """
     return _from(chain, from_base) @ chain.forward(np.zeros(len(chain)))
 
 
 def _from(chain: SerialChain, base: bool) -> FloatArray:
-    """Return the transform of points from the base frame to the frame of `_axes`, (4, 4).
+    """Return the transform of points from the base frame to the frame of comparison, (4, 4).
 
-    The identity if ``base``; else that frame is the first joint's, at zero.
+    That frame is the base's (so the identity) if ``base``, else the first joint's, at zero.
     """
     return np.eye(4) if base else inverse(chain.T_fixed[0])
 

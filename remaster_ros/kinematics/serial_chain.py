@@ -170,7 +170,7 @@ class SerialChain:
 
     @cached_property
     def usual_range(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper limits, rad or m, (k,) each, within ±pi for revolute joints."""
+        """Lower and upper limits, rad or m, (k,) each; of revolute joints clipped to [-pi, pi]."""
         turn = np.where(self.slides, np.inf, np.pi)
         return np.maximum(self.lower, -turn), np.minimum(self.upper, turn)
 
@@ -380,7 +380,10 @@ class SerialChain:
 
     @cached_property
     def T_fixed_z(self) -> FloatArray:
-        """`T_fixed` of the same arm with joint frames rotated so that every joint axis is Z."""
+        """Fixed transforms between joints if every joint axis is Z of its frame, (k + 1, 4, 4).
+
+        `T_fixed` of the same arm with its joint frames rotated.
+        """
         onto_axes = [np.eye(3), *map(with_z_along, self.axes), np.eye(3)]
         turns = transform(onto_axes, np.zeros(3))
         return inverse(turns[:-1]) @ self.T_fixed @ turns[1:]

@@ -251,10 +251,10 @@ def _check_unused_numbers(element: ElementTree.Element, where: str) -> None:
 def _axis(element: ElementTree.Element, kind: str, where: str) -> FloatArray:
     """Return the unit axis of a joint in its frame, (3,); X if it is not given, URDF's default.
 
-    ``kind``: type of the joint; X for a fixed or floating one, whatever is given; ``where``: the
-    joint in words, for the error. Length: from 1e-6 to 1e6.
+    ``kind``: type of the joint; X for a fixed or floating one, whatever is given; ``where``:
+    the joint in words, for the error.
 
-    Raises InputError if its length is not that of a direction.
+    Raises InputError if its length is not between 1e-6 and 1e6, or it is malformed.
     """
     axis_element = element.find('axis')
     # CAD exporters write an axis of 0 0 0 for joints that do not move.

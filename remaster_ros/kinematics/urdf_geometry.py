@@ -56,9 +56,9 @@ class Visual:
 def link_shapes(text: str, read_mesh: MeshReader) -> list[LinkShape]:
     """Read all collision elements of URDF text (which `parse_urdf` accepts).
 
-    ``read_mesh``: called for each mesh; the shape is the convex hull of the returned vertices,
-    scaled. Raises InputError if a geometry is missing, unknown or has no volume, or `read_mesh`
-    raises it.
+    ``read_mesh``: called with the file name of each mesh; the shape is the convex hull of the
+    returned vertices, scaled. If it returns None, the element is left out. Raises InputError
+    if a geometry is missing, unknown or has no volume, or `read_mesh` raises it.
     """
     shapes = []
     for link in ElementTree.fromstring(text).findall('link'):

@@ -136,8 +136,8 @@ class ArmSupervisor:
         """Process the planner's state; return the actions of `tick`.
 
         Any state but ``running`` is a reason not to move, which stops an arm on its way.
-        ``run``: token of the collection run, '' if none. A run other than the last one shows
-        that a person has called /remaster/collect: the counts of failures in a row are
+        ``run``: token of the collection run, '' if none. A run that replaces an earlier one
+        shows that a person has called /remaster/collect: the counts of failures in a row are
         cleared, and what is known of the arm's place is doubted (`Finding.DOUBT`). ``wall_s``:
         now, wall time, s.
         """
@@ -181,8 +181,10 @@ class ArmSupervisor:
     def answered(self, solution: int, wall_s: float) -> list[Action]:
         """Process the recorder's answer that a settled configuration is done; return actions.
 
-        The actions of `tick` are always included; an answer on another solution has no others.
-        ``solution``: its index in the pose's solutions; ``wall_s``: now, wall time, s.
+        ``solution``: index in the pose's solutions of the configuration that was answered;
+        ``wall_s``: now, wall time, s. If the arm is being measured there, the next solution
+        follows; an answer for another solution changes nothing. The actions are those of
+        `tick` either way.
         """
         actions: list[Action] = []
         visit = self._motion.visit
@@ -195,9 +197,9 @@ class ArmSupervisor:
     def emergency(self, stopped: bool, wall_s: float) -> list[Action]:
         """Process whether the robot's safety circuit stops the arm; return the actions of `tick`.
 
-        If it does, they halt the arm ([] once halted), without a command. If not, an emergency
-        stop reported before is no longer in the way; a halt remains. ``wall_s``: now, wall
-        time, s.
+        ``stopped``: if True, the arm is halted without a command ([] if it is halted already);
+        if False, an emergency stop is no longer a reason not to move, but a halt remains until
+        a person clears it. ``wall_s``: now, wall time, s.
         """
         self._interlocks.set('safety', 'the robot reports an emergency stop' if stopped else '')
         return self.tick(wall_s)
@@ -206,10 +208,10 @@ class ArmSupervisor:
         """Process the state of something other than the joints that must be right; return actions.
 
         ``name``: one of `interlocks.OBSERVED`; ``trouble``: what is wrong with it, '' for
-        nothing. A trouble is a reason not to move. During a collection, one of 'rivals' (other
-        publishers of what moves the arm) always halts the arm, braked first if possible; one
-        of another name does if that was right before, else it only stops the arm, as some take
-        a while to become right. ``wall_s``: now, wall time, s.
+        nothing; ``wall_s``: now, wall time, s. A trouble is a reason not to move. During a
+        collection or a motion it halts the arm, braked first if possible, if ``name`` is
+        'rivals' (other publishers of what moves the arm) or was right before. Otherwise it
+        only stops the arm: some of these take a while to become right at first.
         """
         halts = name == 'rivals' or self._interlocks.was_right(name)
         self._interlocks.set(name, trouble)
@@ -220,9 +222,10 @@ class ArmSupervisor:
     def report(self, report: JointReport) -> list[Action]:
         """Process a report of the joints; return actions, those of `tick` included.
 
-        A report that `JointReports.believes` refuses goes to `doubt`. By another one the move
-        or stop under way is judged; during a collection, stamps more than `rules.heartbeat_s`
-        of wall time apart halt the arm instead.
+        A report that `JointReports.believes` refuses goes to `doubt`. A believed one is
+        compared with the move or stop under way; if, during a collection or a motion, its
+        stamp is more than `rules.heartbeat_s` of wall time after that of the last one, it
+        halts the arm instead.
         """
         wall_s = report.wall_s
         if not self.reports.believes(report):
@@ -251,12 +254,15 @@ class ArmSupervisor:
     def doubt(self, why: str, wall_s: float, *, jumped: bool = False) -> list[Action]:
         """Process a report that is not believed or not readable; if that lasts, halt a collection.
 
-        It lasts if for more than `DOUBT_S` no report was believed; until then the actions are
-        those of `tick`. ``jumped``: the arm was reported at a place that it cannot have
-        reached; if that lasts, an idle arm is halted, too. If it lasts and there is nothing to
-        halt, then, unless the planner is paused, the last report and the usual delay of
-        reports are forgotten and learned anew. ``why``: for people; ``wall_s``: when the
-        report came, s.
+        It lasts if more than `DOUBT_S` has passed since the first such report, with no
+        believed report between. Until then the actions are those of `tick`. After that a
+        collection or a motion is halted, and with ``jumped`` an idle arm, too. If neither
+        applies or the arm is halted already, the last report and the usual delay of reports
+        are forgotten, to be learned anew, unless the planner is paused; the actions are those
+        of `tick`.
+
+        ``jumped``: whether the arm was reported at a place that it cannot have reached;
+        ``why``: for people; ``wall_s``: when the report came, s.
         """
         if self._doubted_wall is None:
             self._doubted_wall = wall_s
@@ -276,12 +282,14 @@ class ArmSupervisor:
     def path_found(self, number: int, answer: PathAnswer, wall_s: float) -> list[Action]:
         """Process the answer to the last `CheckPath`, and return actions.
 
-        [] for an answer to an earlier one, or if none is waited for. With a path the move
-        begins, unless the arm may not move, or has moved since ([]: the path is asked for
-        again). Without one the configuration is refused; the arm is halted if it stands where
-        it must not. If only where the arm stands was asked for, no move begins, and an answer
-        without a path halts. ``number``: that of the `CheckPath`; ``wall_s``: now, wall time,
-        s.
+        [] for an answer to an earlier request, or if no request is open; [] also if the arm
+        may not move, or has moved since the request: the path is requested again later. With a
+        path the move begins, if the gate admits it. Without one the configuration is refused
+        and the next one follows; but if the arm stands where it must not, it is halted. If the
+        request was only whether the arm may stand where it is, no move begins, and an answer
+        without a path halts.
+
+        ``number``: that of the `CheckPath`; ``wall_s``: now, wall time, s.
         """
         asked, seen = self._queue.asked(number), self._seen
         if self.state is not Arm.ASKS or asked is None:
@@ -393,10 +401,12 @@ class ArmSupervisor:
         )
 
     def tick(self, wall_s: float) -> list[Action]:
-        """Check the time; return actions that stop or halt on silence, or else go on.
+        """Check the time; return actions that stop or halt the arm, or else the next of its work.
 
-        An emergency stop halts, as does a silent robot during a collection; another reason not
-        to move (`blocked`) stops. [] once halted. ``wall_s``: now, wall time, s.
+        An emergency stop halts, as does a robot that falls silent during a collection or a
+        motion; another reason not to move (`blocked`) stops. Without any, the next piece of a
+        move is sent, or the next move is prepared or begun. [] once halted. ``wall_s``: now,
+        wall time, s.
         """
         self._wall = wall_s
         self._interlocks.look(wall_s)
@@ -501,11 +511,11 @@ class ArmSupervisor:
         return self._interlocks.collecting or self.busy or self.state is Arm.BRAKES
 
     def _gap(self, report: JointReport) -> str:
-        """Reason to halt, if the arm of a collection was not observed for too long; else ''.
+        """Reason to halt, if the arm was not observed for too long during its work; else ''.
 
-        Too long: the stamps of this report and the last one differ by more than
-        `rules.heartbeat_s` of wall time. A gap above `max_gap_s` also adds itself to the time
-        to arrive of a move.
+        Work: a collection or a motion (`_engaged`). Too long: the stamps of ``report`` and of
+        the last one differ by more than `rules.heartbeat_s` of wall time. If they differ by
+        more than `max_gap_s`, the deadline of a move under way is put off by the difference.
         """
         if self._seen is None:
             return ''
@@ -553,12 +563,13 @@ class ArmSupervisor:
     # Inside: the next configuration
 
     def _go_on(self, wall_s: float) -> list[Action]:
-        """Actions that lead to the next move of an arm that stands; [] if it does not.
+        """Actions that lead to the next move of an arm that stands; [] if it does not stand.
 
-        In this order: halt after `MISSED_IN_A_ROW`, or if the arm is reported elsewhere than
-        it was led; ask whether it may stand there; begin the probe, or a way out that was
-        allowed. Then the way to the next solution is asked for; solutions outside the limits
-        are refused. ``wall_s``: now, s.
+        In this order: halt after `MISSED_IN_A_ROW` moves in a row whose next piece came too
+        late, or if the arm is reported elsewhere than it was led; ask whether it may stand
+        where it is; begin the probe, or a way out that a person has allowed; ask for the way
+        to the next solution. Solutions that the planner has refused or that are outside the
+        limits go to `_refuse`. ``wall_s``: now, s.
         """
         seen, queue = self._seen, self._queue
         if seen is None or self.state is not Arm.STANDS or not seen.stands(wall_s):
@@ -625,10 +636,10 @@ class ArmSupervisor:
         return [*actions, *self.tick(wall_s)]
 
     def _refuse(self, solution: int, reason: str) -> list[Action]:
-        """Actions after a configuration was refused: `Failed`, and the next one is next.
+        """Actions after a configuration was refused: `Failed`; the next configuration follows.
 
-        A halt after `REFUSED_IN_A_ROW` of them, none reached between. ``solution``: its index;
-        ``reason``: for people.
+        After `REFUSED_IN_A_ROW` refusals, with none reached between, also a halt.
+        ``solution``: its index; ``reason``: for people.
         """
         self._queue.next = solution + 1
         self._refusals += 1
@@ -640,9 +651,12 @@ class ArmSupervisor:
     # Inside: what becomes of the motion under way
 
     def _conclude(self, outcome: str, why: str, seen: Seen) -> list[Action]:
-        """Actions after the outcome of a visit or a stop; [] while it is under way.
+        """Actions after the outcome of a visit or a stop was judged by a report.
 
-        ``outcome, why``: an `Outcome`. If settled, the counts of failures begin anew.
+        ``outcome``: 'halted' halts; 'settled' gives `Settled`, and the counts of failures
+        begin anew; 'failed' gives the actions of `_fail`; 'over' (a stop, a probe or a way out
+        has ended) and '' (still under way) give []. ``why``: reason for people; ``seen``: the
+        arm's state after the report.
         """
         visit = self._motion.visit
         if outcome == 'halted':
@@ -698,8 +712,9 @@ class ArmSupervisor:
     def _stop(self, reason: str, wall_s: float) -> list[Action]:
         """Actions that stop an arm on its way; the configuration is commanded again later.
 
-        [] if it is on no way, or ends by itself. A halt without a command if its place on the
-        path is unknown. ``reason``: for people; ``wall_s``: now, s.
+        [] if no move or way out is under way (a probe is not braked), or if the arm comes to
+        rest at the end of its move without a command. If its place on the path is unknown, the
+        arm is halted, and nothing is commanded. ``reason``: for people; ``wall_s``: now, s.
         """
         seen = self._seen
         if seen is None or self.state not in (Arm.LEAVES, Arm.MOVES):
@@ -715,8 +730,9 @@ class ArmSupervisor:
     def _step(self, event: Event, *actions: Action) -> list[Action]:
         """Enter the state that `states.ARM` has for an event; return the given actions.
 
-        If the table has no row for the event, or other types of actions, that is a fault of
-        this program: the commands among them are taken back, and a halt is returned alone.
+        It is a fault of this program if the table has no row for the event in this state, or
+        if the row names other types of actions than those given. Then commands among them are
+        taken back, the arm is halted, and `Halted` is the only action.
         """
         state = self.state
         then = ARM[state].get(event)

@@ -146,7 +146,7 @@ class Following:
     def set_back(self, by_s: float) -> None:
         """Shift the rest of the trajectory later by `by_s`, s; negative for earlier.
 
-        The arm rests before the next line of the trajectory.
+        To be called while the arm rests before the next line of the trajectory.
         """
         self.sent += by_s
         self._trail = deque((t - by_s, q, lag - by_s) for t, q, lag in self._trail)
@@ -174,10 +174,11 @@ class Following:
         return self._astray if lasts else ''
 
     def lost(self, seen: Seen, wall_s: float) -> str:
-        """Return why the arm's place on its path is unknown, or ''.
+        """Return why the arm's place on its path is unknown, or '' if it is known.
 
-        It is if the last report is not fresh, or by it the arm has not moved yet for longer than
-        it may lag, is off its path, or loses speed (`_is_slowed`). ``wall_s``: now, wall time, s.
+        Unknown: the last report is not fresh (`Seen.is_fresh`); or by it the arm has not begun
+        to move although more than the allowed lag has passed, is off its path, or loses speed
+        (`_is_slowed`). ``wall_s``: now, wall time, s.
         """
         if not seen.is_fresh(wall_s):
             return f'the last report of the joints is {wall_s - seen.wall:.1f} s old'
@@ -188,14 +189,15 @@ class Following:
     def unseen(self, seen: Seen, wall_s: float, rate: float) -> str:
         """Return why the latest reports do not show the arm going on along its path, or ''.
 
-        '' if reports come (the last at most `JUST_S` old, compared over some `SLOWED_S` to
-        `SLOWED_LONGEST_S`) and the arm is within `ON_PATH_RAD` of where it should be by the
-        last one, or lags evenly: its lag has grown by at most `SLOWED_SHARE` of the time, and
-        it has gone at least `STANDS_SHARE` of what it is behind.
+        They show it if the last one is at most `JUST_S` old, reports over some `SLOWED_S` to
+        `SLOWED_LONGEST_S` can be compared, and the last position is within `ON_PATH_RAD` of
+        the planned one. An arm that is farther from it must lag evenly: its lag has grown by
+        at most `SLOWED_SHARE` of the time, and it has moved by at least `STANDS_SHARE` of its
+        distance from the planned position.
 
-        For a stop it is enough to know where the arm may be (`lost`); what leads it on is for
-        one that moves: a controller may join it to an arm that has been stopped since by a
-        jump. ``wall_s``: now, s; ``rate``: robot time per wall time.
+        That is asked before a further piece of a move is sent; a stop needs only `lost`. A
+        controller may join such a piece by a jump to an arm that was stopped meanwhile.
+        ``wall_s``: now, s; ``rate``: robot time per wall time.
         """
         if wall_s - seen.wall > JUST_S or not self._trail:
             return 'joint_states do not come'
@@ -221,11 +223,11 @@ class Following:
     def window(self, seen: Seen, wall_s: float, rate: float) -> tuple[float, float]:
         """Return the earliest and latest time on the trajectory, s, at which the arm may be now.
 
-        Times since its start. The latest is where the controller's reference is: a stop takes
-        as long to get there as the move did, give or take `JITTER_S`; if the last report came
-        late, it has gone on for so long. The earliest is where an arm is that lags, and that
-        has been stopped by itself since the last report. ``wall_s``: now, s; ``rate``: robot
-        time per wall time.
+        Times since its start. Latest: that of the controller's reference, which is the time
+        that has passed since the start, plus the delay of the last report beyond the usual
+        one, plus `JITTER_S`. Earliest: where the arm was by the last report, with its lag,
+        less `JITTER_S`: it may have been stopped by itself since. ``wall_s``: now, s;
+        ``rate``: robot time per wall time.
         """
         reported, jitter = self.elapsed_s(seen.time), JITTER_S * rate
         elapsed = self.elapsed_s(seen.now(wall_s, rate))
@@ -248,9 +250,10 @@ class Following:
     def _look(self, seen: Seen, elapsed: float) -> str:
         """Deviation of the arm from its path in words, '' if it follows; sets the lag.
 
-        It follows if it is within `ON_PATH_RAD` of the path and, along it, near its place or
-        within the allowed lag and lead. Before it reacts it may stand for `rules.reaction_s`.
-        ``elapsed``: robot time since it was sent, s.
+        It follows if it is within `ON_PATH_RAD` of the path and, along the path, within
+        `ON_PATH_RAD` of its planned place or within the allowed lag and lead. Before it is
+        seen to move it may stand at its start for `rules.reaction_s`. ``elapsed``: robot time
+        since the trajectory was sent, s.
         """
         if not self.reacted:
             still = self._is_still_at_start(seen)
@@ -320,9 +323,10 @@ class Following:
     def _lag(self, elapsed: float, q: FloatArray) -> tuple[float, FloatArray, bool]:
         """Return the lag of `q`, s, its offset from the path, (k,), and whether it is near.
 
-        A lead is a negative lag. Near: the nearest place on the path is within `ON_PATH_RAD`
-        of the planned one, as at the ends of a line a small distance is a long time. The
-        offset is in rad or m. ``elapsed``: time since the start, s.
+        ``q``: reported configuration, rad or m, (k,); ``elapsed``: time since the start, s. A
+        lead is a negative lag. The offset, rad or m, is from the nearest place on the path.
+        Near: this place is within `ON_PATH_RAD` of the planned one; at the ends of a line,
+        where the arm is slow, even so small a distance is a long lag.
         """
         trajectory, units = self.trajectory, self._rules.units
         index, since_s = trajectory.line_at(elapsed)

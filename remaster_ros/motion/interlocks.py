@@ -53,11 +53,12 @@ class Interlocks:
         self._seen[name], self._reasons[name] = wall_s, reason
 
     def planner(self, state: str, run: str, wall_s: float) -> bool:
-        """Process the planner's state; return whether another run has taken the last one's place.
+        """Process the planner's state; return whether its run replaces an earlier, other run.
 
-        It is a sign of life. A run other than the last one, also the first, gives consent to
-        move, unless it appears within `KNOWN_S` of the planner's first sign of life after a
-        silence, when it may be an old one.
+        False for the first run, and for ''. The call is a sign of life. Every new run, also
+        the first, gives consent to move, unless it appears within `KNOWN_S` of the planner's
+        first sign of life after a silence: then it may be an old run, which no person has just
+        begun.
 
         ``state``: anything but ``running`` is a reason not to move; ``run``: token of the
         collection run, '' if none is under way; ``wall_s``: now, s.
@@ -179,12 +180,13 @@ class Interlocks:
         self.consent = after(CONSENT, self.consent, word)
 
     def look_at_interruption(self, wall_s: float) -> None:
-        """Hold the consent while there is a reason not to move; after long, ask a person.
+        """Hold the consent to move while there is a reason not to; after too long, ask a person.
 
-        Held only after the arm was moved in this run. After more than `resume_alone_s` a
-        person may stand beside the arm, and must call /remaster/collect if a run is known;
-        none is needed if the robot reported all the time that its safety circuit does not stop
-        it. Without a reason any more the consent is given again. ``wall_s``: now, s.
+        It is held here only if the arm was moved in this run, and given again once there is no
+        reason. If it was held for more than `resume_alone_s` (with 0: at all), a person may
+        stand beside the arm, and must call /remaster/collect; not if no run is known, or if
+        the robot reported all of that time that its safety circuit does not stop it.
+        ``wall_s``: now, s.
         """
         released = self._is_released
         reason = self._hindrance(wall_s)

@@ -204,9 +204,9 @@ class JointReports:
     def _doubt_time(self, report: JointReport) -> tuple[str, str]:
         """Kind ('late', 'early') and text if a report's delay is unusual; else ('', '').
 
-        Unusual is a difference from the usual delay of more than `LATE_S` plus `LATE_WALL_S`
-        (on a clock faster than `FAST`: `LATE_FAST_WALL_S`) times the clock's rate, at least 1.
-        ('', '') also before the usual delay is known.
+        Unusual: it differs from the usual delay by more than `LATE_S` + r × `LATE_WALL_S`,
+        with `LATE_FAST_WALL_S` in its place if r is above `FAST`; r is the clock's rate, or 1
+        if that is less. ('', '') also before the usual delay is known.
         """
         if self._delay is None:
             return '', ''
@@ -222,8 +222,9 @@ class JointReports:
     def _learn(self, report: JointReport) -> None:
         """Update the usual delay of reports, from stamp to arrival, by a report.
 
-        It is the least of the first reports (`LEARN` and `LEARN_WALL_S` at least); then it
-        follows each report's delay by at most `SHORTEN` down and `DRIFT` up, s per second.
+        At first it is the least delay of the first reports: `LEARN` of them or more, over
+        `LEARN_WALL_S` or more. After that each report's delay moves it, by at most `SHORTEN`
+        down and `DRIFT` up, s for each second since the last report.
         """
         delay = report.clock_s - report.stamp_s
         if self._delay is None:

@@ -116,10 +116,10 @@ class LedLast:
     def confirm(self, q: FloatArray) -> str:
         """Accept a reported position, (k,), if a person was asked about it before.
 
-        It is accepted within the tolerance of the position of the last call, or of `ask`; then
-        it is where the arm was led, and '' is returned. Otherwise it is the position asked
-        about from then on, and what that person is to compare is returned (`elsewhere`; '' if
-        the arm is where it was led).
+        It is accepted as where the arm was led, and '' returned, if it is within the tolerance
+        of the position that a person was asked about last, by `ask` or by the last call.
+        Otherwise it is not accepted: ``q`` is now the position asked about, and what the
+        person has to compare is returned (`elsewhere`; '' if the arm is where it was led).
         """
         asked, self._asked = self._asked, q
         if asked is None or self.differs(asked, q):

@@ -301,8 +301,10 @@ class MotionGate:
     def stop_on_curve(self, sent_s: float, cut_s: float) -> Admitted:
         """Return a stop along the curve that is under way, as its last piece.
 
-        Another timing of what was admitted: it needs no check, and is not refused. ``sent_s,
-        cut_s``: as of `pieces.stop_of`. Raises LookupError if no move is under way.
+        ``sent_s``: when the piece is sent; ``cut_s``: when it leaves the timing of the curve
+        to brake; s since the move's start. Only the timing of what was admitted is changed: it
+        needs no check, and is not refused. No move is under way afterwards. Raises LookupError
+        if none was before.
         """
         if self._under_way is None:
             raise LookupError('no move is under way')
@@ -496,7 +498,11 @@ def _too_long() -> str:
 
 
 def _way_out_limits(limits: MotionLimits) -> MotionLimits:
-    """Limits for a slow way out of a contact: `WAY_OUT_SPEED`, `WAY_OUT_TOOL_SPEED`."""
+    """Limits for a slow way out of a contact.
+
+    `WAY_OUT_SPEED` times the joint speeds of ``limits``, and at most `WAY_OUT_TOOL_SPEED` for
+    the fastest point; the other limits are the same.
+    """
     return replace(
         limits,
         velocity=WAY_OUT_SPEED * limits.velocity,
@@ -568,9 +574,9 @@ class Cubic:
     ) -> Cubic:
         """Return the cubics with given positions and velocities at both ends (Hermite).
 
-        ``q, velocity``: at the start, rad or m, per s, (n, k); ``end_q, end_velocity``: at the
-        end. ``duration_s``: s, (n, 1). Of one cubic a number and (k,). Coefficients of a
-        duration of 0 are not finite.
+        For n cubics: ``duration_s``: s, (n, 1); ``q, velocity``: at the start, rad or m, per
+        s, (n, k); ``end_q, end_velocity``: at the end, (n, k). For one cubic: a number, and
+        (k,). With a duration of 0 the coefficients are not finite.
         """
         gap = end_q - q
         with np.errstate(divide='ignore', invalid='ignore'):

@@ -70,10 +70,13 @@ class Visit:
     def judge(self, seen: Seen, rate: float) -> Outcome:
         """Return the outcome of a report, for an arm on its way to the end of the move.
 
-        'halted' if it is off its path, stands for `stall_s` off its target, or reports the
-        target to the last bit; 'settled'; 'failed' after the deadline; 'over' at the end of a
-        probe or a way out, where nothing is measured; else UNDER_WAY. ``rate``: robot time per
-        wall time.
+        'halted' if it is off its path, stands for `stall_s` off its target after the move's
+        time, or reports at the end the target to the last bit (an echo of the command);
+        'settled' if it stands still at its target (`SettleDetector`), which sets the deadline
+        of the recorder's answer; 'failed' after the deadline (this, and the halt after
+        `stall_s`, only once the arm is seen to have left its start); 'over' `PROBE_WAIT_S`
+        after the end of a probe or a way out, where nothing is measured; else UNDER_WAY.
+        ``rate``: robot time per wall time.
         """
         detector, rules = self.detector, self.rules
         trajectory, elapsed = self.trajectory, self.following.elapsed_s(seen.time)
@@ -123,8 +126,8 @@ class Visit:
         """Return the outcome of a report, for an arm that must stand until the recorder answers.
 
         'halted' if the arm is more than `MOVED_RAD` from its target, 'failed' if the answer is
-        late, else UNDER_WAY. ``recorder_waits``: whether the recorder waits on purpose: the
-        deadline begins anew.
+        late, else UNDER_WAY. ``recorder_waits``: whether the recorder waits on purpose: then
+        the deadline is `rules.answer_timeout_s` after this report.
         """
         moved, units = np.abs(seen.q - self.trajectory.end), self.rules.units
         if units.largest(moved) > MOVED_RAD:
@@ -155,10 +158,11 @@ class Braking:
     def judge(self, seen: Seen) -> Outcome:
         """Return the outcome of a report for a braking arm.
 
-        'over' if after the stop's time it stands within `near` of the stop's end. 'halted' if
-        before that it stands for `patience_s` more than `ON_PATH_RAD` from the end, or if it
-        is not there by the deadline (later after a gap in the reports), whether it stands or
-        moves. Else UNDER_WAY.
+        While the stop's time is not over: 'halted' if the arm has stood for `patience_s`, more
+        than `ON_PATH_RAD` from the stop's end, else UNDER_WAY. After that: 'over' if it stands
+        within `near` of the stop's end; 'halted' if it does not by the deadline, whether it
+        stands elsewhere or moves; else UNDER_WAY. After a gap in the reports the deadline is
+        at least 2 × `STANDING_S` after the first report that follows.
         """
         stands, way = seen.stands(seen.wall), seen.q - self.end
         off, text = self.units.largest(way), self.units.in_radians(way, 4)
@@ -177,10 +181,11 @@ class Braking:
 
 
 def _led_now(seen: Seen, wall_s: float) -> float:
-    """Robot time now, s, from the last report on at the rate of wall time; for moves in pieces.
+    """Robot time now, s: that of the last report and the wall time since; for moves in pieces.
 
-    A simulated clock that runs faster than the wall's waits for each report to be taken
-    (`simulated_clock.LEADS`): it is not ahead of the last one by what its rate would have.
+    The clock's rate is not used: a simulated clock that is faster than the wall's waits until
+    each report is taken (`simulated_clock.LEADS`), so that it has not gone on at its rate
+    since.
     """
     return seen.now(wall_s, 1.0)
 
@@ -227,9 +232,9 @@ class MotionUnderWay:
     def near(self) -> float:
         """Largest allowed distance of an arm at rest from the end of a command, rad.
 
-        `still_tolerance` plus twice (`OTHER_PLACES`) the most that the reports were off where
-        the arm has settled: their noise, and what the servo leaves. At most
-        `arrive_tolerance`, and that before it has settled anywhere.
+        `still_tolerance` plus `OTHER_PLACES` (2) times the largest distance of a report from
+        the target where the arm has settled so far: noise, and what the servo leaves. At most
+        `arrive_tolerance`, which is also the value before the arm has settled anywhere.
         """
         settle = self.rules.settle
         if not np.isfinite(self._stood_off):
@@ -284,29 +289,31 @@ class MotionUnderWay:
     def next_end(self) -> FloatArray | None:
         """End of the next piece of a move that is sent in pieces, rad or m, (k,); else None.
 
-        Of the last piece its own end.
+        If the present piece is the last one, the end of that.
         """
         return None if self.visit is None or self._piece is None else self._piece.next_end
 
     @property
     def patience_s(self) -> float:
-        """Longest delay of a move's next piece before `due` returns 'missed', s of robot time.
+        """Usual time from when a next piece is due until `due` returns 'missed', s.
 
-        A long move is sent in pieces. With stamps it counts from `RENEWED_S` after the last
-        piece was sent; without, it is `STEP_REST_S` from the end of the last step.
+        In robot time. A long move is sent in pieces. With stamps a piece is due `RENEWED_S`
+        after the last one was sent. Without, the time is `STEP_REST_S`, and counts from the
+        planned end of the last step.
         """
         if not self._keeps_stamps:
             return STEP_REST_S
         return self._horizon_s - RAMP_S - GUARD_S - RENEWED_S
 
     def due(self, seen: Seen, wall_s: float) -> Literal['', 'renew', 'missed']:
-        """Return 'renew' if the move's next piece is due now, 'missed' if too late, else ''.
+        """Return 'renew' if the move's next piece has to be sent now, 'missed' if it is too late.
 
-        '' also without a move in pieces, and after its last piece. With stamps a piece is due
-        `RENEWED_S` after the last one was sent (not before `JOINED_S`), and too late from
-        `GUARD_S` before that one's stop begins. Without, it is due when the arm stands at the
-        end of the last step, and too late when the planned rest there is over. ``wall_s``:
-        now, s.
+        '' if it is not due yet, if the move has no pieces, or if its last piece was sent. With
+        stamps: due `RENEWED_S` after the present piece was sent, at the earliest `JOINED_S`
+        after the move's start; missed from `GUARD_S` before the present piece leaves the
+        trajectory (`Piece.cut_s`), usually to begin its stop. Without stamps: due when the arm
+        stands at the end of the present step; missed when the planned rest there is over.
+        ``seen``: the last report; ``wall_s``: now, s.
         """
         piece, visit = self._piece, self.visit
         if piece is None or visit is None or piece.is_last:
@@ -323,10 +330,11 @@ class MotionUnderWay:
         return 'renew' if elapsed_s >= max(self._piece_sent_s + RENEWED_S, JOINED_S) else ''
 
     def renew(self, seen: Seen, wall_s: float) -> Renew:
-        """Return the action that sends the next piece of the move, the present one from then on.
+        """Return the action that sends the next piece of the move; it becomes the present piece.
 
-        Without stamps it is the next step, and the times of the rest of the move are shifted
-        so that it begins now, sooner or later than planned. ``wall_s``: now, s.
+        Without stamps it is the next step, and the times of the rest of the move are shifted,
+        so that the step begins now, sooner or later than planned. ``seen``: the last report;
+        ``wall_s``: now, s.
 
         Raises MotionRefusedError as `MotionGate.renew` and `MotionGate.step`. There must be a
         move in pieces.
@@ -369,11 +377,13 @@ class MotionUnderWay:
         self._brake(self._piece.end, max(begins, seen.now(wall_s, rate)), over, rate)
 
     def judge(self, seen: Seen, rate: float, *, recorder_waits: bool) -> Outcome:
-        """Return the outcome of a report for the stop, or else the move; UNDER_WAY without either.
+        """Return the outcome of a report for the stop or the move that is under way.
 
-        As of `Braking.judge`, `Visit.judge`, or in `Arm.MEASURES` `Visit.judge_settled`. How
-        far a settled arm is from its target is kept, for `near`. ``rate``: robot time per wall
-        time; ``recorder_waits``: as of `Visit.judge_settled`.
+        Of a stop by `Braking.judge`; of a move that is measured at its end (`Arm.MEASURES`) by
+        `Visit.judge_settled`, of another move by `Visit.judge`; UNDER_WAY if there is neither.
+        When the arm settles, its distance from the target is kept for `near`. ``seen``: the
+        arm's state after the report; ``rate``: robot time per wall time; ``recorder_waits``:
+        as of `Visit.judge_settled`.
         """
         if self.braking is not None:
             return self.braking.judge(seen)
@@ -435,10 +445,11 @@ class MotionUnderWay:
         return Stop(admitted, reason, wall_s)
 
     def _stop_on_curve(self, reason: str, seen: Seen, wall_s: float, rate: float) -> Stop:
-        """Return the stop of an arm on a curve, as a piece of the same function of time.
+        """Return the stop of an arm on a curve, as a piece with the same stamp as the move.
 
-        It begins `STOP_AHEAD_S` from now, or where the present piece ends in its own stop.
-        Arguments as of `stop`.
+        The piece follows the curve until `STOP_AHEAD_S` from now (but until `JOINED_S` +
+        `STOP_AHEAD_S` after the move's start at least), or until the present piece would begin
+        to stop if that is sooner; there it begins to brake. Arguments as of `stop`.
         """
         assert self.visit is not None
         assert self._piece is not None
@@ -465,11 +476,12 @@ class MotionUnderWay:
         self.braking = Braking(end, begins, over, deadline, self.near, patience_s, units)
 
     def take_back(self) -> None:
-        """Take the last command back, which was not sent; the state is not changed.
+        """Undo the last command, which was not sent; the state is not changed.
 
-        Where the arm was led, the piece of the move that was sent and when, and the times of
-        the visit are those before the command. Only the last of two commands can be taken
-        back.
+        Restored to what they were before it: where the arm was led (`led`), the present piece
+        of the move and when that was sent, and the times of the visit if `renew` has shifted
+        them. `visit` and `braking` are kept. Of two commands in a row only the last can be
+        undone.
         """
         self.led.take_back()
         self._piece, self._piece_sent_s = self._piece_before

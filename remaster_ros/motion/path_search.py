@@ -83,9 +83,9 @@ class PathSearch:
 
 
 def beside_chords_m(model: CollisionModel) -> float:
-    """Bound on the relative motion of two bodies from a curve to the chords of its samples, m.
+    """Bound on two bodies' relative displacement between a curve and its chords, m.
 
-    No joint is further than `SAGITTA_RAD` from these chords.
+    The chords join the curve's samples; no joint is further than `SAGITTA_RAD` from them.
     """
     joints = len(model.chain)
     return model.travel(np.zeros(joints), np.full(joints, SAGITTA_RAD))

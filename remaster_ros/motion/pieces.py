@@ -95,9 +95,9 @@ def piece_of(trajectory: Trajectory, sent_s: float, horizon_s: float) -> Piece:
 def stop_of(trajectory: Trajectory, sent_s: float, cut_s: float) -> Piece:
     """Return the piece by which an arm on a curve stops, or ends with the curve if that is sooner.
 
-    ``sent_s``: when it is sent, ``cut_s``: from where on it differs from the curve, both s
-    from the trajectory's start. The controller is on the curve when the piece comes, and goes
-    on.
+    ``sent_s``: when the piece is sent; ``cut_s``: when the stop begins; s from the
+    trajectory's start. Until `cut_s` the piece is the curve itself, which the controller
+    follows already when the piece comes.
     """
     points, cut_s = _piece(trajectory, sent_s, cut_s - sent_s + RAMP_S)
     return Piece(points, cut_s, points[-1].q)
@@ -139,8 +139,10 @@ def _piece(
 ) -> tuple[tuple[Waypoint, ...], float]:
     """Return waypoints of a piece, and until when it follows the trajectory, s (inf for the last).
 
-    Behind that is a stop in `RAMP_S` on the line; a line's own ramp is taken if the stop would
-    fall into it. ``sent_s``: s from the trajectory's start; ``horizon_s``: as of `piece_of`.
+    After that it stops in `RAMP_S` along the line. If the stop would begin within the line's
+    own ramp down, the piece ends with the line instead, and follows the trajectory until the
+    rest there is over. ``sent_s``: s from the trajectory's start; ``horizon_s``: longest time
+    from then to the piece's end, s.
     """
     begins_s = max(sent_s - PAST_S, min(sent_s - LEAST_PAST_S, RAMP_S), 0.0)
     points = [p for p in trajectory.waypoints() if p.time_s > begins_s + SAME_S]

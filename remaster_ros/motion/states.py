@@ -80,9 +80,11 @@ class Then:
 
 
 def _always(state: Arm) -> dict[Event, Then]:
-    """Return the transitions of most states: a halt halts, and a stop needs no command.
+    """Return the transitions that most states have: of `STOP`, `HALT` and `GIVEN_UP`.
 
-    ``state``: that of the rows of the table, which a stop does not change.
+    A stop leaves the state as it is, without an action; a halt, and a controller that gives
+    up, lead to `Arm.HALTED` with the action `Halted`. ``state``: the state whose transitions
+    they are.
     """
     return {
         Event.STOP: Then(state),

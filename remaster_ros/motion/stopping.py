@@ -41,9 +41,10 @@ def stop_on_line(line: Line, low_s: float, high_s: float, limits: MotionLimits) 
     """Return position and time at which an arm on a line comes to rest if it stops now.
 
     ``low_s, high_s``: the arm's place is that of the line at a time between these, s since its
-    start; ``limits``: for the accelerations. It is the shortest stop of those tried of at
-    least `STOP_S` that is right (`_Stretch.first`) from all of these places; else the longest
-    shorter one; else one in the time left on the line. The waypoint's time is from now.
+    start; ``limits``: for the accelerations. A stop is right if it is from all of these places
+    (`_Stretch.first`). Of the durations tried it is the shortest of at least `STOP_S` that is
+    right; else the longest below `STOP_S` that is; else the stop of `_Stretch.rest_of_line`.
+    The waypoint's time is from now.
     """
     stretch = _Stretch(line, low_s, high_s, limits)
     longest = max(LONGEST_S, LONGEST_SHARE * (high_s - low_s))
@@ -88,10 +89,13 @@ class _Stretch:
         return None
 
     def rest_of_line(self) -> tuple[float, float]:
-        """Return time, s, and end of a stop in the time that the slowest arm has left on the line.
+        """Return duration, s, and end, share of the line, of a stop near the line's end.
 
-        The end, a share of the line, is the farthest at which no arm of the stretch passes the
-        line's end.
+        For a stretch in the line's last moments, from which `first` finds no stop. The
+        duration is the largest of: the time left on the line from the first place of the
+        stretch, 1.5 times the time that the rest of the way takes from there at cruising
+        speed, and `END_OF_STOP_S`. The end is the largest share for which no cubic of the
+        stretch passes the line's end; an arm that is beyond it comes back a little.
         """
         time = max(self._left_s, 1.5 * (1.0 - self._x[0]) / self._rate, END_OF_STOP_S)
         low, high = -1.0, 1.0
@@ -101,10 +105,10 @@ class _Stretch:
         return time, low
 
     def _coefficients(self, time: float, end: float) -> tuple[FloatArray, FloatArray]:
-        """Return the quadratic and cubic coefficients of the stops from each place, (n,) each.
+        """Return the coefficients of u² and u³ of the stop's cubic from each place, (n,) each.
 
-        Of powers of the share of the stop's time. ``time``: of the stop, s; ``end``: share of
-        the line.
+        u is the share of the stop's time, 0 to 1; the cubic's value is a share of the line.
+        ``time``: duration of the stop, s; ``end``: share of the line at which it ends.
         """
         gap, v = end - self._x, self._v * time
         return 3 * gap - 2 * v, v - 2 * gap

@@ -89,7 +89,10 @@ class RampedPath:
         return min((gone_up - gone_down) * self.rate, 1.0), (up - down) * self.rate
 
     def time_s(self, share: float) -> float:
-        """Return when a share of the path is gone, s: the inverse of `share`, clipped to 0 … 1."""
+        """Return when a share of the path is covered, s since its start: the inverse of `share`.
+
+        ``share``: clipped to 0 … 1.
+        """
         share = min(max(share, 0.0), 1.0)
         ramp = 0.5 * RAMP_S * self.rate
         if share <= ramp:
@@ -107,12 +110,13 @@ class Line(RampedPath):
     def within(
         cls, limits: MotionLimits, start: FloatArray, end: FloatArray, peak_m: float = 0.0
     ) -> Line:
-        """Return the fastest line within `HEADROOM` times the speeds and accelerations.
+        """Return the fastest line within `HEADROOM` times the allowed speeds and accelerations.
 
-        ``start, end``: rad or m, (k,); ``peak_m``: speed of the fastest point of arm and tool
-        if the whole way takes a second, m/s; 0 for no such limit. Accelerations count
-        `STOPPABLE` times. At the least rate, 0.1 / `LONGEST_S`, the line takes too long for
-        the gate.
+        Of the acceleration limits only the share `STOPPABLE` is allowed. ``start, end``: rad
+        or m, (k,); ``peak_m``: speed of the fastest point of arm and tool if the whole way
+        takes a second, m/s; 0 for no such limit. The rate is never below 0.1 / `LONGEST_S`,
+        even if that is above a limit: a line at that rate takes too long for the gate, which
+        refuses it.
         """
         way = np.maximum(np.abs(end - start), 1e-12)
         # The ramp is of a given length: what the joints may accelerate bounds the speed as well.
@@ -190,8 +194,8 @@ class Curve(RampedPath):
         At every place within the speeds, and within the accelerations also of a stop in
         `RAMP_S` from there. The straight piece at the beginning is begun and stopped as a line
         is, and takes at least `LEAD_S`; that at the end holds the ramp. ``peak_m``: as of
-        `Line.within`. At the least rate, 0.1 / `LONGEST_S`, the motion takes too long for the
-        gate.
+        `Line.within`. The rate is never below 0.1 / `LONGEST_S`, even if that is above a
+        limit: a motion at that rate takes too long for the gate, which refuses it.
         """
         rate = min(
             float(np.min(allowed_rates(limits, spline))),
@@ -267,8 +271,8 @@ def allowed_rates(limits: MotionLimits, spline: Spline) -> FloatArray:
     """Return the largest rate of the share at each sample of a spline, 1/s, (p,).
 
     By `HEADROOM` times the speeds and accelerations, the latter also of a stop in `RAMP_S`
-    from there; on the straight beginning also as of a line. The speeds of points are not
-    looked at.
+    from there. On the straight piece at the beginning also by the accelerations of ramps as of
+    `Line.within`, with `STOPPABLE`. The limit of the speed of points is not looked at.
     """
     shares, _ = spline.samples
     first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))

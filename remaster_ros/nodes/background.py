@@ -53,7 +53,10 @@ class Background:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        """Thread: run queued jobs in order, keep each result or exception; end at a None."""
+        """Thread: run queued jobs in order, store each result or exception.
+
+        It ends at a None in the queue.
+        """
         while (item := self._work.get()) is not None:
             work, then = item
             try:

@@ -157,9 +157,10 @@ class BagRecorder:
         )
 
     def subscribe_rest(self) -> None:
-        """Record the topics that the recorder does not use itself; nothing if it records no bag.
+        """Record the topics that the recorder node does not use itself; nothing without a bag.
 
-        They are the target pose, status, registrations, and joint offsets with their deviations.
+        They are the target pose, status, registrations, and joint offsets with their standard
+        deviations.
         """
         if self._began is None:
             return

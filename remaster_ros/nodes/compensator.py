@@ -230,8 +230,8 @@ class CompensatorNode(RemasterNode):
         """Halt after a fault of this program: cancel goals, refuse trajectories until ~/enable.
 
         If the arm moves, a braking trajectory is published on the controller's topic. The
-        fault is logged as in `RemasterNode.on_fault`. Nothing but that during the node's
-        construction.
+        fault is logged as in `RemasterNode.on_fault`. While the node is being constructed, the
+        fault is only logged.
         """
         super().on_fault(error)
         if not hasattr(self, '_steady'):
@@ -254,7 +254,10 @@ class CompensatorNode(RemasterNode):
     # Whether it may pass anything on
 
     def _on_description(self, message: String) -> None:
-        """Keep the published robot description, and whether it goes with the correction."""
+        """Store the published robot description, and why it does not fit the correction, if so.
+
+        The reason is that of `_described_trouble`, '' if it fits.
+        """
         self._description = message.data
         self._described = self._described_trouble()
 
@@ -288,9 +291,9 @@ class CompensatorNode(RemasterNode):
         """Return why trajectories are refused at present; '' if they are not.
 
         In this order: a halt; a controller that is itself a compensator; no fresh joint states
-        (`ArmReports.is_fresh`); a temperature older than `WARM_S`; no time; the robot
-        description; other publishers of joints or commands; an arm that is elsewhere
-        (`_misled`).
+        (`ArmReports.is_fresh`); a temperature older than `WARM_S`; a clock without time; a
+        robot description that does not fit the correction; another publisher of the arm's
+        joints, or of commands; an arm that is not where it was led to (`_misled`).
         """
         topic = self.resolve_topic_name(JOINTS)
         if self._halted:
@@ -398,8 +401,9 @@ class CompensatorNode(RemasterNode):
     def _turn(self, on: bool) -> str:
         """Switch the correction on or off; log and return a sentence with its file and state.
 
-        The motion gate and the true joint angles are made anew; a trajectory that is still
-        being corrected will not be passed on.
+        The motion gate, and the object that computes true joint angles, are replaced by new
+        ones for this correction. A trajectory that is still being corrected will not be passed
+        on.
         """
         self._on, self._wanted = on, -1
         self._true = self._motion.TrueAngles(self._correction.compensator)
@@ -453,11 +457,12 @@ class CompensatorNode(RemasterNode):
         return self._temperature_c if self._correction.compensator.model.grows else None
 
     def _on_joint_state(self, message: JointState, info: Any) -> None:
-        """Publish joint states with the true angles; as reported with the correction off.
+        """Publish received joint states, with the arm's true angles if the correction is on.
 
-        Of the arm nothing is published before the first switch, nor if a position is not finite or
-        beyond `FARTHEST_RAD`, which is logged. Messages that name no joint of the arm are passed
-        on unchanged.
+        With the correction off the angles are published as reported. Joint states of the arm
+        are not published before the correction is first switched on or off, nor if a position
+        is not finite or beyond `FARTHEST_RAD`, which is logged. Messages that name no joint of
+        the arm are published unchanged.
         """
         if not self._order.concerns(message):
             # A gripper's: the planner wants to know of it too.
@@ -495,11 +500,11 @@ class CompensatorNode(RemasterNode):
     ) -> None:
         """Correct a planner's trajectory in the background; then pass it on, or refuse it.
 
-        ``pass_on``: called with the corrected message; ``refuse``: called with the reason. It
-        is refused at once if `_trouble` has a reason, before the first switch, or if its stamp
-        is neither 0 nor within `NOW_S` of now. A newer trajectory replaces one that is still
-        being corrected. An empty one, which lets the controller hold the arm, is passed on at
-        once.
+        ``pass_on``: called with the corrected message; ``refuse``: called with the reason. The
+        trajectory is refused at once if `_trouble` has a reason, if the correction was never
+        switched on or off, or if its stamp is neither 0 nor within `NOW_S` of now. A newer
+        trajectory replaces one that is still being corrected. A trajectory without points, by
+        which the controller holds the arm, is passed on at once.
         """
         number = self._wanted = next(self._numbers)
         try:
@@ -561,9 +566,10 @@ class CompensatorNode(RemasterNode):
     ) -> tuple[Any, JointTrajectory]:
         """Return the corrected trajectory (`SentTrajectory`) and its message.
 
-        ``warm``: temperature, °C, or None; ``planner_q``: the arm's angles as the planner was
-        told, rad, (k,), None with the correction off. Uses no state that callbacks change. Raises
-        InputError if the trajectory is refused.
+        ``arm``: the arm's last reports, a snapshot; ``gate``: admits the corrected motion;
+        ``in_use``: the correction; ``warm``: temperature, °C, or None; ``planner_q``: the
+        arm's angles as published to the planner, rad, (k,), None with the correction off. Uses
+        no state that callbacks change. Raises InputError if the trajectory is refused.
         """
         wanted = self._motion.Trajectory(*_points(message, self._names))
         passed = self._motion.corrected_for_controller(
@@ -572,12 +578,13 @@ class CompensatorNode(RemasterNode):
         return passed, self._message(passed.admitted)
 
     def _outdated(self, number: int, arm: Any, found: Any) -> str:
-        """Return why a trajectory is not passed on although it was worked out; '' if it is.
+        """Return why a corrected trajectory is no longer to be passed on; '' if it is to be.
 
-        Reasons: a newer trajectory; a trouble now; the arm stood and has moved by more than
-        `START_RAD` since; the arm moves, and the motion gate refuses the trajectory from where
-        it is now. ``number``: of the trajectory; ``arm``: reports that it was corrected for;
-        ``found``: result of `_work_out`, or its exception.
+        Reasons: a newer trajectory has come; `_trouble` has a reason now; the arm stood and
+        has moved by more than `START_RAD` since; the arm moves, and the motion gate refuses
+        the trajectory from where the arm is now. ``number``: of the trajectory; ``arm``:
+        snapshot of the arm's reports that `_work_out` used; ``found``: result of `_work_out`,
+        or its exception.
         """
         if number != self._wanted:
             return 'another trajectory has come since'
@@ -845,8 +852,8 @@ def _points(
     """Return times (n,), s, positions and velocities (n, k), joints in the order of `names`.
 
     Velocities are None if no point has any, or there are no points (n = 0). Raises InputError:
-    other joints than the arm's, a joint named twice, points that are not whole, or velocities of
-    some points only.
+    other joints than the arm's, a joint named twice, a point without a position for each
+    joint, or with velocities of some joints only, or velocities at some points only.
     """
     given = tuple(message.joint_names)
     none = np.zeros((0, len(names)))

@@ -98,11 +98,11 @@ class ForeignGoals:
         }
 
     def begin(self) -> None:
-        """Count only goals that come from now on.
+        """Ignore the goals that are under way now; count only those that come later.
 
-        joint_trajectory_controller may list a goal that was replaced as under way until the next
-        one comes, so that what a former bridge has left says nothing. If the arm really moves by
-        it, nothing is commanded before it stands.
+        joint_trajectory_controller may list a goal that was replaced as under way until the
+        next one comes, such as a goal of a bridge that has ended. If such a goal really moves
+        the arm, the bridge commands nothing before the arm stands.
         """
         self._earlier = set(self._active)
 

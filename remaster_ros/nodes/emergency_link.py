@@ -42,11 +42,11 @@ class EmergencyLink:
             node.create_subscription(Bool, self.topic, self._on_message, qos)
 
     def trouble(self) -> str:
-        """Return why the state of the safety circuit is unknown, or ''.
+        """Return why the state of the safety circuit is unknown; '' if it is known.
 
-        It is if no message has come, no publisher is left, or the last `PERIODIC` messages came
-        regularly (at most `silence_s` apart) and the silence since exceeds their longest interval
-        by more than that. '' without a topic.
+        Unknown if no message has come, no publisher is left, or the last `PERIODIC` messages
+        came regularly (at most `silence_s` apart) and the silence since exceeds their longest
+        interval by more than `silence_s`. '' without a topic.
         """
         if not self.topic:
             return ''

@@ -127,9 +127,11 @@ class FakeRobotNode(RemasterNode):
             wait_s = max(left_s / self.world.rate, POLL_WALL_S)
 
     def _on_taken(self, message: Header) -> None:
-        """Record how far a process, by its id, has processed messages; ignore a malformed id.
+        """Record up to which stamp a process has processed messages.
 
-        World time waits for it (`Pace`). ``frame_id``: the id, and `LEADS` for who leads the arm.
+        World time waits for it. ``message``: the stamp, and as ``frame_id`` the process id,
+        followed by `LEADS` if that process leads the arm. A message with a malformed id is
+        ignored. See `Pace`.
         """
         pid, _, what = message.frame_id.partition(' ')
         if pid.isdecimal():
@@ -169,7 +171,7 @@ class FakeRobotNode(RemasterNode):
             self.get_logger().error(f'trajectory dropped: {dropped}')
 
     def close(self) -> None:
-        """End the thread and close the World; delete its folder if it was drawn here."""
+        """End the thread and close the World; delete the World's folder if this node made it."""
         self._ending.set()
         self._thread.join()
         self.world.close()

@@ -42,11 +42,12 @@ class TriggeredSensors:
         self._shots: dict[str, _Shot] = {}
 
     def look(self, pairing: Pairing, absent: Mapping[str, str], now: float) -> None:
-        """Send the requests that a pairing still needs, and report refusals to it, at once.
+        """Send measurement requests that a pairing still needs; report failures to the pairing.
 
-        A service that is missing for `MISSING_WALL_S` is a failure, as is a refusal. A request is
-        repeated to a sensor that was absent meanwhile, and to one whose reading was lost.
-        ``absent``: sensor -> why; ``now``: time of the recorder's watchdogs, s.
+        Returns at once, to be called again until all sensors are decided. A service that is
+        missing for `MISSING_WALL_S` is a failure, as is a refusal. A request is repeated to a
+        sensor that was absent meanwhile, and to one whose reading was lost. ``absent``: sensor
+        -> why; ``now``: time of the recorder's watchdogs, s.
         """
         if pairing is not self._pairing:
             self._pairing, self._shots = pairing, {}
@@ -63,10 +64,11 @@ class TriggeredSensors:
                 pairing.fail(name, f'the service {client.srv_name} is not there')
 
     def _take_answer(self, name: str, shot: _Shot, pairing: Pairing, now: float) -> None:
-        """Report a refusal to the pairing; forget the request if its reading was lost.
+        """Report a refused request to the pairing; forget an accepted one whose reading was lost.
 
-        Nothing before the answer, and for `PATIENCE_WALL_S` after it. ``name``: the sensor;
-        ``now``: wall time, s. A lost reading is then requested again.
+        Until `PATIENCE_WALL_S` after the service's answer nothing is done, as the reading may
+        still come. A lost reading is requested again by the next `look`. ``name``: the sensor;
+        ``now``: wall time, s.
         """
         assert shot.future is not None
         response = shot.future.result() if shot.future.done() else None

@@ -135,8 +135,9 @@ class MeasureService:
     def _expected(self, marker: str = '') -> FloatArray | None:
         """Expected position of a marker in the sensor's frame, m, (3,).
 
-        ``marker``: '' for the sensor's first. None before registration, or before the first pose
-        (with several markers: joint states).
+        ``marker``: name; the sensor's main marker has the name ''. None before the sensor's
+        registration, or before the first pose of the tool (with several markers: joint
+        states).
         """
         if self._T_N_R is None or self._T_R_T is None:
             return None
@@ -145,8 +146,8 @@ class MeasureService:
     def step(self) -> None:
         """Wait for a command of the arm; prepare the driver when the arm has arrived.
 
-        Returns None: after half a second without a command, when the driver is prepared, or
-        early if the node ends. A DeviceError of the driver becomes the node's `trouble`.
+        Returns after half a second without a command, when the driver is prepared, or early if
+        the node ends. A DeviceError of the driver becomes the node's `trouble`.
         """
         if not self._commanded.wait(0.5):
             return
@@ -200,10 +201,11 @@ class MeasureService:
         return response
 
     def _order(self) -> list[str]:
-        """Return the markers to measure, that of the last reading first; '' is the sensor's first.
+        """Return the names of the markers in the order of measuring, the one measured last first.
 
-        [''] alone if no position can be expected yet (before registration, or before the arm's
-        pose is known): the driver finds a marker by itself then.
+        The sensor's main marker has the name ''. [''] alone if no position can be expected yet
+        (before registration, or before the arm's pose is known): the driver finds a marker by
+        itself then.
         """
         if self._expected() is None:
             return ['']
@@ -212,7 +214,8 @@ class MeasureService:
     def _measure(self, marker: str) -> float:
         """Measure a marker once, publish the reading and its temperature; return its stamp, s.
 
-        ``marker``: '' for the sensor's first. Raises DeviceError if there is no measurement.
+        ``marker``: name; the sensor's main marker has the name ''. Raises DeviceError if there
+        is no measurement.
         """
         expected = self._expected(marker)
         if len(self._markers_T) > 1 and expected is not None:

@@ -98,10 +98,11 @@ def waypoints_message(
 ) -> JointTrajectory:
     """Return the message remaster/joint_waypoints with the paths of a pose visit.
 
-    It has the configurations to go through before each joint solution, in order;
-    ``time_from_start.sec`` is 1 + the index of the solution they lead to, as in
-    joint_solutions; ``nanosec`` is 0 for a corner of straight lines, and 1 + `SHARES` times
-    the share for a point of a curve. No points if all paths are straight lines.
+    It has the configurations to go through before each joint solution, in order. Of each,
+    ``time_from_start.sec`` is 1 + the index of the solution it leads to, as in
+    joint_solutions; ``nanosec`` is 0 for a corner of straight lines, and for a point of a
+    curve 1 + `SHARES` times the curve's parameter there (0 at its begin, 1 at its end). No
+    points if all paths are straight lines.
     """
     message = JointTrajectory(joint_names=list(joint_names))
     message.header = header
@@ -117,11 +118,11 @@ def waypoints_message(
 
 
 def curves_by_solution(message: JointTrajectory) -> dict[int, FloatArray]:
-    """Return the shares of the curves in a message remaster/joint_waypoints, by solution.
+    """Return the parameters of the points of curves in a message remaster/joint_waypoints.
 
-    Index of the solution, from 0 -> share of the curve at each of its waypoints, (n,), n >= 2,
-    ascending from 0 to below 1; solutions reached by straight lines are left out. Raises
-    InputError for other shares.
+    Index of the solution to which the curve leads, from 0 -> curve parameter at each of its
+    waypoints, (n,), n >= 2, ascending from 0 to below 1 (1 at the solution). Solutions reached
+    by straight lines are left out. Raises InputError for other parameters.
     """
     marks: dict[int, list[int]] = {}
     for point in message.points:

@@ -10,7 +10,11 @@ from remaster_ros.nodes.runtime_files import runtime_folder
 
 
 def page_name(domain: int, node: str) -> str:
-    """Return the name of a live page's files; ``node``: full name, such as ``/left/watch``."""
+    """Return a name for the files of a live page, one for each node in each ROS domain.
+
+    ``domain``: ROS domain id; ``node``: full name of the node that serves the page, such as
+    ``/left/watch``.
+    """
     return f'domain_{domain}{node.replace("/", ".")}'
 
 

@@ -174,9 +174,10 @@ class Optimizer(RemasterNode):
     def _discover(self) -> tuple[Path, str]:
         """Search the session for causes, save the result; return the report's path and a summary.
 
-        Look-alikes that an earlier search of the same session had left open are decided too.
-        Raises RemasterError: the session or the folder cannot be used, or the data do not allow a
-        search.
+        If an earlier search of this session could not tell a cause from a look-alike (another
+        cause that fits nearly as well), the result also states which of the two the data
+        support now, or that this is still open. Raises RemasterError: the session or the
+        folder cannot be used, or the data do not allow a search.
         """
         # Imported when it is needed, as it takes a second: the node is there at once.
         from remaster_ros.discovery.decision import decisions

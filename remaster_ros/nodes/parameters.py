@@ -36,9 +36,10 @@ _ALWAYS = ('use_sim_time', 'start_type_description_service')
 def declare(node: Node, kind: type[T], on_change: Callable[[T], None] | None = None) -> T:
     """Declare the fields of `kind` as parameters of `node`; return an instance with their values.
 
-    ``on_change``: called with all parameters when live ones are to change, in an executor's
-    thread; the new ones hold from its return on. If it raises InputError, the change is
-    refused, with its text as the reason. None: all are read-only.
+    ``on_change``: called with all parameters when some are set while the node runs, in an
+    executor's thread; the new ones hold from its return on. If it raises InputError, the
+    change is refused, with its text as the reason. Only fields declared `live` can be set so;
+    the others are read-only, and all are if ``on_change`` is None.
 
     Raises InputError for an unknown parameter or an invalid value; it names the node, the
     parameter and what is allowed.
@@ -87,10 +88,11 @@ def _changed(
     current: T,
     parameters: Sequence[Any],
 ) -> T:
-    """Return the parameters with new values of live ones.
+    """Return all parameters of a node, with new values of those that are set while it runs.
 
-    ``current``: all parameters so far; ``parameters``: rclpy's, to be changed. Raises InputError
-    for a name that is unknown or not live, or a value that `check` refuses.
+    ``fields``: of the dataclass, by name; ``current``: all parameters so far; ``parameters``:
+    rclpy's, to be set. Raises InputError for a name that is unknown or not declared `live`, or
+    a value that `check` refuses.
     """
     for item in parameters:
         if item.name not in fields or not fields[item.name].metadata['live']:
@@ -105,7 +107,8 @@ def _changed(
 def _descriptor(field: dataclasses.Field[Any]) -> ParameterDescriptor:
     """ROS descriptor of a parameter, with its description, unit, choices and range.
 
-    A range with a hole (``off``) becomes a range down to `off`; `check` looks at the hole.
+    A field may allow, besides its range, the single value `off` below it. The ROS range then
+    reaches down to `off`, and `check` refuses the values in between.
     """
     meta = field.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''

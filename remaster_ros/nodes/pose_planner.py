@@ -336,10 +336,10 @@ class PosePlanner(RemasterNode):
             self._joint_states = None
 
     def _on_settled(self, message: JointState) -> None:
-        """Set the arm's configuration from a message, rad or m.
+        """Set the arm's configuration from the bridge's report that the arm has settled, rad or m.
 
-        It is the wanted one, before correction, if the bridge corrects. An invalid message
-        changes nothing but `run.why`, which says what is wrong.
+        If the bridge corrects, these are the joint positions wanted, before the correction. An
+        invalid message changes nothing but `run.why`, which says what is wrong.
         """
         try:
             # The nominal joint angles of the tool's pose, if the bridge corrects.
@@ -355,8 +355,10 @@ class PosePlanner(RemasterNode):
     def _on_record(self, record: events.EventRecord) -> None:
         """Update the state by an event or state of another node.
 
-        A halt, a bridge that asks for collect, and a changed setup that stops end the run as
-        paused; an optimizer that knows enough of this plan ends the poses to fit.
+        The run ends as paused if the arm is halted, if the bridge asks in this run for
+        /remaster/collect, or if a change of the setup has to be checked by a person. If the
+        optimizer reports that the precision of this plan is enough, no more poses to fit are
+        announced.
         """
         now = time.monotonic()
         self._peers.take(record, now)

@@ -260,7 +260,10 @@ class _Outlet(Outlet):
         self._node._registrations.publish(message)
 
     def measure(self) -> None:
-        """Trigger the single-shot sensors of the present reading, if any; none from a bag."""
+        """Trigger the single-shot sensors for the configuration that is being read, if any.
+
+        Nothing is triggered if the recorder takes its messages from a replayed bag.
+        """
         pairing = self._node.recorder.recording.pairing
         if pairing is not None and not self._node.recorder.from_bag:
             self._node.sensors.trigger(pairing)

@@ -201,10 +201,11 @@ class Replay(RemasterNode):
                 raise InputError(_live(info, f'listens to {name}'))
 
     def _look_who_listens(self, publisher: Publisher) -> None:
-        """Raise InputError if a new subscriber of a topic that moves an arm is a live node.
+        """Raise InputError if a live node has come to subscribe to a topic that moves an arm.
 
-        If their number has changed, wait `NEWCOMER_S` for their other endpoints, and check as
-        `_refuse_live`.
+        Checked as by `_refuse_live`, only if the number of subscribers of ``publisher`` has
+        changed since the last call. If there are any, the check waits `NEWCOMER_S`, until the
+        other topics of a new node are discovered.
         """
         count = publisher.get_subscription_count()
         known = self._listeners.get(publisher.topic_name)
@@ -276,10 +277,11 @@ class Replay(RemasterNode):
             self._dropped[topic] += count
 
     def _await_taken(self, topic: str) -> None:
-        """Wait until all subscribers of a topic have its messages; after `TAKEN_S` count drops.
+        """Wait until all subscribers of a topic have received its messages, at most `TAKEN_S`.
 
-        All messages sent since the last wait count as dropped then. Later messages would take the
-        places of those that a slow subscriber has not taken yet.
+        After that time all messages sent since the last wait are counted in `_dropped`.
+        Without waiting, later messages would overwrite those still in the queue of a slow
+        subscriber.
         """
         publisher, count = self._publishers_by_topic[topic], self._untaken.pop(topic, 0)
         if not self._ending.is_set() and not publisher.wait_for_all_acked(
@@ -288,9 +290,11 @@ class Replay(RemasterNode):
             self._dropped[topic] += count
 
     def _require_all(self) -> None:
-        """Wait for the last messages; InsufficientDataError if any were dropped or torn off.
+        """Wait for the last messages; raise InsufficientDataError if any did not arrive.
 
-        The error has the topics and counts. Nothing is raised if the node is to end.
+        Either they were dropped on the way to a subscriber, or the bag ends in an incomplete
+        message, as its writer was killed. The error has the topics and counts. Nothing is
+        raised if the node is to end.
         """
         for topic in list(self._untaken):
             self._await_taken(topic)
@@ -321,11 +325,11 @@ class Replay(RemasterNode):
 
 
 class Acknowledged:
-    """Number of messages sent by a replay that the recorder has not taken yet, by its service.
+    """Waits until the recorder has taken the messages of a replay, as its service reports.
 
     ``node``: the replay, which is spun by another thread than the one that waits here.
-    Attributes: ``sent``: messages sent since the last wait, by topic, and on remaster/events
-    by `taken_key`.
+    Attributes: ``sent``: number of messages sent since the last wait, by topic; on
+    remaster/events by `taken_key`.
     """
 
     def __init__(self, node: RemasterNode) -> None:
@@ -372,8 +376,9 @@ class Acknowledged:
     def wait(self, ending: threading.Event) -> dict[str, int]:
         """Wait until the recorder has taken all messages sent since the last call.
 
-        Returns the number not taken, by topic, if none were taken for `TAKEN_S`; {} if all were,
-        without a recorder, or if `ending` is set. `sent` is empty afterwards.
+        Returns the number not taken, by topic, if none were taken for `TAKEN_S`; {} if all
+        were, without a recorder, or if `ending` is set. With a recorder `sent` is empty
+        afterwards.
         """
         if self._before is None or not self.sent:
             return {}

@@ -70,10 +70,10 @@ class OnlyPublisher:
         return sum(publisher.topic_name == self._topic for publisher in self._node.publishers)
 
     def _count(self) -> None:
-        """Subscribe to count living publishers by their leases.
+        """Subscribe, once, to count the living publishers of the topic by their leases.
 
-        It is never ended: Fast DDS reports to a subscription that is made again no publishers
-        whose lease it has seen before.
+        The subscription is kept for good: a new one would get no report from Fast DDS on
+        publishers whose lease was seen before.
         """
         if self._counter is None:
             self._counter = self._node.create_subscription(

@@ -470,10 +470,11 @@ class RobotBridge(RemasterNode):
     # What comes in
 
     def _on_record(self, record: events.EventRecord) -> None:
-        """Pass the states of planner and recorder on to the supervisor.
+        """Pass what planner and recorder report on to the supervisor.
 
-        Also the end of a configuration of the present pose, the recorder's answer; all else is
-        ignored, but for the arm model that every record states.
+        That is: the planner's state, what the recorder waits for, and the recorder's outcome
+        of a solution of the present pose. Other records are ignored, but of each the arm model
+        it states is kept, to compare it with the bridge's.
         """
         now = self.steady_s()
         self._models.take(record, now)
@@ -499,7 +500,10 @@ class RobotBridge(RemasterNode):
         )
 
     def _model_trouble(self, now: float) -> str:
-        """Return how a peer or the robot's description is of another arm; '' if none is."""
+        """Return why another node, or the robot description, has a different arm; '' if none has.
+
+        ``now``: `steady_s`, s.
+        """
         return self._models.trouble(now) or self._described
 
     def _on_waypoints(self, message: JointTrajectory) -> None:
@@ -624,9 +628,10 @@ class RobotBridge(RemasterNode):
             self._do(self.supervisor.observe(name, trouble, now))
 
     def _keeps_stamps(self) -> bool:
-        """Whether the controller keeps the stamps of trajectories, by parameter or topic.
+        """Whether the controller starts a trajectory at the time of its stamp.
 
-        The parameter auto asks whether the controller publishes its state (`ControllerStates`).
+        By the parameter `trajectory_stamps`; if that is auto, it does if it publishes its
+        state as joint_trajectory_controller does (`ControllerStates`).
         """
         if self.p.trajectory_stamps != 'auto':
             return self.p.trajectory_stamps == 'kept'
@@ -713,9 +718,10 @@ class RobotBridge(RemasterNode):
         self._keep_end()
 
     def _tell_missed(self) -> None:
-        """Publish and log that the arm stops if pieces of its move have come too late.
+        """Publish and log that the arm stops, as the next piece of its move came too late.
 
-        Counted in ``stopped``. Nothing if none has since the last call.
+        A long move is sent in pieces, one after the other. The event is counted in
+        ``stopped``. Nothing if no piece was late since the last call.
         """
         if self.supervisor.missed == self._missed:
             return

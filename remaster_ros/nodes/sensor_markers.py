@@ -80,8 +80,8 @@ class SensorNode(MeasuringNode):
     ``name``, or, if no registered sensor has it, that of the name on the command line.
     Attributes: ``kind``: key of the driver in `remaster_ros.sensors.registry.DRIVERS`;
     ``sensor``: its name in the cell, which is the frame of its readings; ``trouble``: why the
-    device was not opened, or what it refused last; ''; ``in_use``: lock, held while a command
-    of the device is under way.
+    device was not opened, or what it refused last, '' if nothing; ``in_use``: lock, held while
+    a command of the device is under way.
     """
 
     def __init__(self, name: str) -> None:

@@ -62,10 +62,11 @@ class SessionKeeper:
             self.full = ''
 
     def look(self) -> bool:
-        """Retry a failed write and repair files that others changed; return whether any was.
+        """Repeat a failed write, and repair session files that others changed.
 
-        A write is repeated every `RETRY_S`, files are checked every `CHECK_S`; False between
-        two checks. To be called often, by a timer.
+        Return whether a file was repaired since the last check. A write is repeated every
+        `RETRY_S`, files are checked every `CHECK_S`; False between two checks. To be called
+        often, by a timer.
         """
         now = time.monotonic()
         if self._waiting is not None and now - self._tried_wall > RETRY_S:
@@ -98,9 +99,11 @@ class SessionKeeper:
         self.bag.reopen()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Close session and bag with an exit status; log an error if it becomes another one.
+        """Close session and bag with an exit status.
 
-        Raises DiskError if the session remains open: then the bag does too.
+        If the session could only be closed with a different status, since files were damaged
+        beyond repair, that is logged as an error. Raises DiskError if the session remains
+        open; the bag does too then.
         """
         self.journal.close(exit_status)
         self._report_restored()

@@ -68,7 +68,7 @@ class SteadyTime:
             node.create_subscription(Clock, '/clock', self._on_clock, CLOCK_QOS, raw=True)
 
     def _on_clock(self, message: bytes) -> None:
-        """Note when the simulated clock came."""
+        """Note the wall time at which a clock message came; its content is not read."""
         self._heard_wall = time.monotonic()
 
     def __call__(self) -> float:
@@ -112,9 +112,9 @@ class ReportsTaken:
     def take(self, stamp: Time) -> None:
         """Publish, on `TAKEN`, that all messages up to a stamp have been processed.
 
-        At most every `TAKEN_EVERY_S` of stamps; a node that leads the arm, at every new stamp.
-        If the stamp does not change, again after that in wall time. Nothing without a
-        simulation.
+        At most every `TAKEN_EVERY_S` of stamps; by a node that leads the arm, at every new
+        stamp. If the stamp is that of the last call, published again once `TAKEN_EVERY_S` of
+        wall time have passed. Nothing without a simulation.
         """
         if self._publisher is None:
             return

@@ -343,7 +343,8 @@ class Watch(RemasterNode):
 def _tolerant(callback: Callable[[Any], None]) -> Callable[[Any], None]:
     """Return a callback that drops messages for which `callback` raises; nothing is logged.
 
-    Of RemasterError, ValueError and msgspec's errors: other nodes report these messages.
+    That is for RemasterError, ValueError and msgspec's errors, since other nodes log these
+    messages; other exceptions are raised.
     """
 
     def receive(message: Any) -> None:

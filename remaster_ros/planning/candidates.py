@@ -80,7 +80,7 @@ class PoseRanges:
 
 @dataclass(frozen=True)
 class LineOfSight:
-    """A sensor that has to see a marker at every configuration, with their positions."""
+    """A sensor that has to see a marker at every configuration; positions of both."""
 
     sensor: str  # Name of the sensor
     sensor_R: FloatArray  # Position of the sensor in R, m, (3,)
@@ -144,10 +144,11 @@ class PlanningScene:
     ) -> Plan:
         """Draw candidate poses that face one sensor; return the usable ones.
 
-        ``count``: number of candidates; ``sensors_R``: position in R of each sensor that has to
-        see its marker, m, (3,); the tool faces `aim_at`, at its rough position if that is not
-        among them; ``rng``: source of randomness. An arm with fewer than six joints gets reachable
-        poses near the candidates. Raises InputError as `candidate_poses`.
+        ``count``: number of candidates; ``sensors_R``: position in R of each sensor that has
+        to see its marker, m, (3,); ``rng``: source of randomness. The tool faces the scene's
+        sensor `aim_at`: at its position in ``sensors_R``, or at its rough position if it is
+        not there. An arm with fewer than six joints gets reachable poses near the candidates.
+        Raises InputError as `candidate_poses`.
         """
         # A sensor that is not required may be unregistered.
         aim = {**self.rough_R, **sensors_R}[self.aim_at]

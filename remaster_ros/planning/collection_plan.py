@@ -132,12 +132,13 @@ def look_ahead(
     visit: PoseVisit | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> CollectionPlan:
-    """Plan the remaining visits of tours, the collection's last, without changing the tours.
+    """Plan the remaining visits of a session's tours, without changing the tours.
 
-    ``planner``: plans the tours, its designs are stated; ``tours``: one after the other;
-    ``visit``: remaining visit of the pose under way, which comes first; ``start``:
-    configuration of the arm, rad or m, (k,); other arguments as of `plan_collection`. If the
-    poses do not determine the offsets, the plan's `undetermined` says why.
+    ``planner``: plans the tours, and has the design that the plan states; ``tours``: one after
+    the other, that of the collection last; ``visit``: remaining visit of the pose under way,
+    which comes first; ``start``: configuration of the arm, rad or m, (k,); other arguments as
+    of `plan_collection`. If the poses do not determine the offsets, the plan's `undetermined`
+    says why.
 
     Raises InsufficientDataError if no configuration can be reached.
     """
@@ -231,10 +232,10 @@ def session_time_s(planner: TourPlanner, tour: Tour, start: FloatArray) -> float
 def rough_collection(planner: TourPlanner) -> tuple[Tour, Expected]:
     """Return the tour of a collection, with sensors at their rough positions, and its precision.
 
-    No paths are searched, which takes nearly all the time of `plan_collection`: unreachable
-    configurations (`count_with_free_path` counts poses) and the robot time are unknown.
-    Raises InsufficientDataError if no pose is left to fit, or the poses do not determine the
-    offsets.
+    No paths are searched, which takes nearly all the time of `plan_collection`; so it is unknown
+    which configurations can be reached (`count_with_free_path` counts the poses that can), and
+    how long the robot takes. Raises InsufficientDataError if no pose is left to fit, or the poses
+    do not determine the offsets.
     """
     tour = planner.collection(planner.rough_places)
     return tour, expected_precision(planner, planner.rough_places, tour.plans[FITTED].poses)

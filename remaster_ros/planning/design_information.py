@@ -232,9 +232,9 @@ class DesignInformation:
     def gains(self, chosen: Sequence[int], root: FloatArray) -> FloatArray:
         """Return the first-order decrease of trace(L' M^-1 L) by each configuration, (n,).
 
-        It is trace(K' dM K) for the information dM that the configuration adds to M, that of
-        the chosen ones, and K = M^-1 L, which is ``root``, (f, r). ``chosen``: indices of the
-        configurations so far.
+        M is the information of the configurations chosen so far (``chosen``: indices), L the
+        weights of the goal (`Goal.weights`). The decrease is trace(K' dM K) for the
+        information dM that the configuration adds, with K = M^-1 L, which is ``root``, (f, r).
         """
         sums, count = self._sums(chosen)
         of_sums, of_each = sums @ root, self.weighted @ root
@@ -249,8 +249,9 @@ class DesignInformation:
     def _sums(self, chosen: Sequence[int]) -> tuple[FloatArray, IntArray]:
         """Sums of J/v over the chosen configurations of each pose, (poses, s, 3, f), and counts.
 
-        J/v as in `weighted`, for s sensors; the counts of chosen configurations are (poses,).
-        Both are 0 for a pose without one. ``chosen``: indices of configurations.
+        J/v is the attribute `weighted`: for each of s sensors the mean derivative of its
+        markers over its variance. The counts of chosen configurations are (poses,). Both are 0
+        for a pose without one. ``chosen``: indices of configurations.
         """
         which = np.array(chosen, dtype=np.int64)
         sums = np.zeros((int(self.pose.max()) + 1, *self.weighted.shape[1:]))
@@ -258,10 +259,11 @@ class DesignInformation:
         return sums, np.bincount(self.pose[which], minlength=len(sums))
 
     def _factor(self, count: IntArray) -> FloatArray:
-        """Factors pose_sigma² / (1 + m pose_sigma² / v) of the common errors, (p, s), m².
+        """Factors of the error that the configurations of a pose share, (p, s), m².
 
-        ``count``: number m of configurations of each of p poses, (p,); s sensors. See the
-        module.
+        They are pose_sigma² / (1 + m pose_sigma² / v) for s sensors and p poses, with the
+        variances pose_sigma² of the shared error and v of a frame of the sensor. ``count``:
+        number m of configurations of each pose, (p,).
         """
         return self.pose_variance / (1.0 + count[:, None] * self.pose_variance * self.weight)
 

@@ -218,7 +218,9 @@ def stays_in_sight(
 ) -> bool:
     """Whether sensors see every marker all along the curves and at their ends.
 
-    ``sensors_R``: position of each sensor in the robot base frame R, m, (3,).
+    ``design``: has the curves; ``scene``: obstacles and largest angles of sight; ``settings``:
+    have the sensors with their markers; ``sensors_R``: position of each sensor in the robot
+    base frame R, m, (3,); sensors without one are left out.
     """
     sights = sights_of(scene, settings.with_sensors_at(sensors_R).sensors)
     ends = np.array([pose.solutions[0] for pose in (design.begin, *design.ends)])
@@ -382,9 +384,10 @@ class _Search:
         return sample[int(self._rng.choice(neighbours))]
 
     def _cost_of(self, pieces: Sequence[_Piece]) -> float:
-        """Cost of curves: log of the expected variance of the offsets, and prices of their time.
+        """Cost of curves: log of the expected variance of the offsets, plus penalties on time.
 
-        Time beyond the given in all, and curves shorter than `SHORTEST_S`, cost `OVERTIME`.
+        Penalised, by `OVERTIME` times the share in excess or missing, are a total time above
+        that given for measured motion, and each curve shorter than `SHORTEST_S`.
         """
         total = np.sum([piece.information for piece in pieces], axis=0)
         seconds = [piece.curve.duration_s for piece in pieces]
@@ -519,11 +522,12 @@ def in_sight(scene: PlanningScene, sights: Sequence[LineOfSight], q: FloatArray)
 def shared_curve(points: FloatArray, travel: TravelTime) -> tuple[FloatArray, Curve, float] | None:
     """Spline curve through configurations (n, k), timed so that its limits are used evenly.
 
-    Each interval has a share by the time that its straight line takes; then intervals in which
-    the curve could be faster become shorter, and the others longer.
+    The curve parameter goes from 0 to 1. Between two configurations it first grows by the
+    share of time that their straight line takes; then intervals in which the curve could be
+    faster are made shorter, and the others longer.
 
-    Returns shares (n,), from 0 to 1, the curve, and the largest speed of a point, m/s; None if
-    the spline would have too many samples.
+    Returns the curve parameter at each configuration, (n,), from 0 to 1, the curve, and the
+    largest speed of a point, m/s; None if the spline would have too many samples.
     """
     limits = travel.limits
     way = np.abs(np.diff(points, axis=0))

@@ -205,8 +205,9 @@ class MovingInformation:
 def process_along(tool: FloatArray) -> FloatArray:
     """Correlations of a sensor's error between tool poses along a motion, (n, n).
 
-    ``tool``: poses T_R_T, (n, 4, 4). Those of the process of `calibration.path_noise` with the
-    lengths that a fit begins with.
+    ``tool``: poses T_R_T, (n, 4, 4). They are of the random process by which a fit models an
+    error that changes along a path (`calibration.path_noise`), with the correlation lengths
+    that a fit begins with.
     """
     noise = PathNoise(
         tool[:, :3, 3],
@@ -226,9 +227,10 @@ def _information(
 ) -> FloatArray:
     """Information of rows of a sensor about p parameters, (p, p).
 
-    ``columns``: derivatives of the markers, (n, markers, 3, p); ``process``: correlations of the
-    error that a row's markers share, (n, n); ``own_m``: standard deviation, per axis, of another
-    such error of each marker by itself, m.
+    ``columns``: derivatives of the markers, (n, markers, 3, p); ``process``: correlations
+    between rows of the errors that change along the motion, (n, n): one that all markers
+    share, and one of each marker by itself; ``own_m``: standard deviation of the latter, per
+    axis, m.
     """
     n, count, _, p = columns.shape
     white = sensor.sigma_m**2 / FRAMES_OF_ROW

@@ -191,10 +191,11 @@ def designed_plans(
 
 
 def _floors(information: DesignInformation, candidates: IntArray, whole_poses: bool) -> Floors:
-    """Return the least contents of a design, lowered to what the candidates can reach.
+    """Return the least numbers of poses and of repeated poses that a design must have.
 
-    If poses are visited whole, all of them should have two solutions or more. ``candidates``:
-    indices of the candidate configurations.
+    Lowered to what the candidates can reach. With ``whole_poses`` (a pose is visited in all
+    its solutions) all of the least number of poses should have two solutions or more.
+    ``candidates``: indices of the candidate configurations.
     """
     count = np.unique(information.pose[candidates], return_counts=True)[1]
     floors = Floors()
@@ -205,8 +206,8 @@ def _floors(information: DesignInformation, candidates: IntArray, whole_poses: b
 def _held_out(plan: Plan, solutions: int | None, rng: np.random.Generator) -> Plan:
     """Return a plan of the first `HELD_OUT_POSES` validation poses of a plan.
 
-    The others are counted as dropped, not needed. ``solutions``: how many of each pose are
-    drawn at random; None for all.
+    The other poses and solutions are counted as dropped, with the reason 'not needed'
+    (`NOT_NEEDED`). ``solutions``: how many of each pose are drawn at random; None for all.
     """
     kept = tuple(
         PlannedPose(

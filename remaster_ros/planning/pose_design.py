@@ -89,8 +89,10 @@ class Goal:
     def weights(self, information: DesignInformation) -> FloatArray:
         """Return L (f, r) with criterion trace(L' M^-1 L), which is at most 1 at the goal.
 
-        M is an information matrix. In a mixture each part has its share (`tool_share`). Raises
-        InsufficientDataError if no joint is identifiable, unless only the tool counts.
+        M is an information matrix. If both joints and tool count, the variance of each is
+        divided by that of its goal, and weighted by 1 - `tool_share` (joints) and `tool_share`
+        (tool). Raises InsufficientDataError if no joint is identifiable, unless only the tool
+        counts.
         """
         parts = []
         if self.tool_share < 1.0:
@@ -111,7 +113,8 @@ class Goal:
     def is_met(self, joint_rms: float, tool_rms: float) -> bool:
         """Whether standard deviations of joints, rad, and tool, m, reach the goal.
 
-        Joints do not count if only the tool has weight (`tool_share` 1), the tool not at 0.
+        At a `tool_share` of 1 the joints do not count, at a `tool_share` of 0 the tool does
+        not.
         """
         joints = self.tool_share == 1.0 or joint_rms <= self.joint_std_rad
         return joints and (self.tool_share == 0.0 or tool_rms <= self.tool_std_m)
@@ -306,8 +309,9 @@ class _Search:
         """Return the index of the unit to add: that with the largest gain for its time.
 
         The gain is the decrease of the criterion's logarithm, divided by the time to the power
-        `URGENCY`. Once the goal is reached, only units that the floors lack are considered, of
-        whole poses that of least time. ``chosen``: indices of units, not all.
+        `URGENCY`. If the goal is reached, but not the least numbers of poses (`Floors`), only
+        units that bring these nearer are considered (`_missing`); if units are whole poses,
+        the one that takes the least time is taken. ``chosen``: indices of units, not all.
         """
         allowed = np.ones(len(self._information), bool)
         if chosen and self._goal.is_reached(self._information, chosen):
@@ -325,11 +329,13 @@ class _Search:
         )
 
     def _missing(self, chosen: Sequence[int]) -> BoolArray:
-        """Whether each unit brings the design nearer to the floors, (n,).
+        """Whether each unit brings the design nearer to the least numbers of poses, (n,).
 
-        Every new pose while there are fewer than `poses` of the floors, and also, while fewer than
-        `repeated` have several solutions chosen, one more solution of a pose with a single one.
-        With whole poses, as long as `repeated` is lacking, only new poses with several.
+        The least numbers are those of `Floors`. If there are fewer poses than `Floors.poses`,
+        every unit of a new pose does; if fewer than `Floors.repeated` have several solutions
+        chosen, one more solution of a pose with a single one. If units are whole poses and
+        there are fewer than `Floors.repeated`, only new poses with several solutions do.
+        ``chosen``: indices of units.
         """
         pose, several = self._information.pose, self._units.solutions > 1
         count = np.bincount(self._poses(chosen), minlength=int(pose.max()) + 1)
@@ -342,10 +348,10 @@ class _Search:
         return new
 
     def filled(self, chosen: Sequence[int], most: int) -> list[int]:
-        """Return the chosen units and more, until the design is done, in a new list.
+        """Return the chosen units and more, until goal and floors are reached (`is_done`).
 
-        It also ends with `most` configurations, or when all units are chosen. ``chosen``:
-        indices of units.
+        The list is a new one. It also ends with `most` configurations, or when all units are
+        chosen. ``chosen``: indices of units.
         """
         chosen = list(chosen)
         while len(chosen) < len(self._information) and not self.is_done(chosen):
@@ -375,9 +381,10 @@ class _Search:
         return self.filled(remaining, len(self._poses(chosen)) + MOST_MORE)
 
     def thinned(self, chosen: Sequence[int]) -> list[int]:
-        """Return the design with superfluous units removed, the least useful first.
+        """Return the design with superfluous units removed, the least useful first, in a new list.
 
-        It stays done; at least one unit remains. ``chosen``: indices of units.
+        Goal and floors remain reached (`is_done`); at least one unit remains. ``chosen``:
+        indices of units.
         """
         chosen = list(chosen)
         while len(chosen) > 1 and self.is_done(fewer := self._without_least(chosen)):

@@ -246,7 +246,10 @@ class _Choice:
         return True
 
     def _information(self, rivals: Rivals) -> DesignInformation:
-        """Return the information of all configurations with the columns of a pair; kept."""
+        """Return the information of all configurations with the columns of a pair of causes.
+
+        Computed at the first call for a pair, and kept for later ones.
+        """
         if rivals not in self._known:
             self._known[rivals] = DesignInformation.of(
                 self.chain,

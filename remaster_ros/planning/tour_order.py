@@ -240,10 +240,10 @@ class Tour:
         return [v for v in self.order if v[2] in self._unvisited[v[0]].get(v[1], ())]
 
     def _due(self, split: str, index: int) -> list[int]:
-        """Return the solutions of a pose to visit now, as indices of those not visited.
+        """Return the solutions of a pose to visit now, as indices into its solutions.
 
-        All of them; of a tour with a given order those that follow one another in it.
-        ``split, index``: of the pose, which in such a tour is next.
+        All that are not visited; of a tour with a given order those that come next in it, up
+        to the first visit to another pose ([] if that is next). ``split, index``: of the pose.
         """
         if not self.order:
             return self._unvisited[split][index]

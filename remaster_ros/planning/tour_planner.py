@@ -231,10 +231,12 @@ class TourPlanner:
         return Tour(self._chain, plans, model=self.model, reference_every=self._every, order=order)
 
     def moving(self, T_R_N: Mapping[str, FloatArray]) -> Tour:
-        """Return the tour of curves to fit and poses to validate, in their order.
+        """Return the tour of a collection that is measured while the arm moves along curves.
 
-        The only pose to fit is where the first curve begins. Each of the first poses to validate
-        has its curve (`PlannedPose.way`), which begins at the pose before it.
+        The rows to fit are measured along the curves; the only pose to fit is where the first
+        curve begins. Then come the poses to validate, at standstill, in their order: each of
+        the first ones is the end of a curve (`PlannedPose.way`), which begins at the pose
+        before it.
 
         ``T_R_N``: registrations, (4, 4) each. Sets `moving_design`. Raises as `design_moving`.
         """
@@ -258,11 +260,11 @@ class TourPlanner:
         )
 
     def prepare(self) -> None:
-        """Choose the curves of `moving` ahead, for sensors at their rough positions.
+        """Choose the curves for measuring in motion ahead, for sensors at their rough positions.
 
-        That takes half a minute. `moving` uses them if the registered sensors see all markers
-        along them; if none are found, nothing is raised here, and `moving` says why. Nothing
-        without `moving_s`.
+        That takes half a minute. `moving` uses the curves if the registered sensors see all
+        markers along them. If no curves are found, nothing is raised here; `moving` tries
+        again, and raises. Nothing is done without `moving_s`.
         """
         if not self.moving_s:
             return
@@ -277,9 +279,11 @@ class TourPlanner:
     def _curves(
         self, sensors_R: Mapping[str, FloatArray], scene: PlanningScene | None = None
     ) -> MovingDesign:
-        """Return curves for sensors at positions in the robot base frame R, m, (3,) each.
+        """Return the joint-space curves along which the arm is measured while it moves.
 
-        ``scene``: None for that of this planner. Raises as `design_moving`.
+        ``sensors_R``: sensor -> position in the robot base frame R, m, (3,); ``scene``: arm,
+        obstacles and sights, None for the planner's own. The curves begin near the likely end
+        of a registration. Raises as `design_moving`.
         """
         rng = np.random.default_rng([self._seed, *b'moving'])
         seconds = self.moving_s or MOVING_S

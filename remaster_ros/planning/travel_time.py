@@ -120,10 +120,11 @@ class TravelTime:
         return trajectory, float(np.max(np.multiply(peaks, rates)))
 
     def curve(self, points: FloatArray, shares: FloatArray) -> tuple[Curve, float]:
-        """Return the fastest motion along a curve, and its largest point speed, m/s.
+        """Return the fastest motion along a spline curve, and its largest point speed, m/s.
 
-        ``points``: with begin and end, (n, k); ``shares``: of the curve, at all but the end, which
-        has 1, (n - 1,). Raises ValueError as `Spline.through`.
+        ``points``: configurations that the curve passes, with begin and end, rad or m, (n, k);
+        ``shares``: curve parameter at all of them but the end, ascending from 0, (n - 1,); at
+        the end it is 1. Raises ValueError as `Spline.through`.
         """
         spline = Spline.through(points, np.append(shares, 1.0))
         at, places = spline.samples

@@ -83,9 +83,10 @@ class Answer:
 
     @property
     def plain_pad(self) -> bool:
-        """Whether each joint is set alone, at the pad's 0, and the pad counts as the URDF does.
+        """Whether the teach pendant needs no conversion: zero-offsets are set one joint at a time.
 
-        True also if there is nothing to set. Pad: the robot's teach pendant.
+        If so, each joint is mastered at the pendant's 0, and the pendant counts angles as the URDF
+        does. True also if there is nothing to set.
         """
         return all(len(group) == 1 and group[0].is_plain for group in self.on_the_pad)
 
@@ -210,7 +211,10 @@ def judged_rows(inputs: Inputs) -> tuple[BoolArray, bool]:
 
 
 def all_taken_out(found: Discovered | None) -> bool:
-    """Whether there are causes, not 'undetermined', all certain errors of the measurement."""
+    """Whether all causes of a discovery are certain errors of the measurement, none of the arm.
+
+    False without a discovery, without causes, or if its verdict is 'undetermined'.
+    """
     return (
         found is not None
         and found.verdict != 'undetermined'
@@ -220,10 +224,10 @@ def all_taken_out(found: Discovered | None) -> bool:
 
 
 def _stages(inputs: Inputs) -> list[tuple[str, FloatArray]]:
-    """Title, and errors of all rows, mm, (n,), at each stage: today, zero-offsets, then the rest.
+    """Title, and errors of all rows, mm, (n,), at each stage: today, zero-offsets, then more.
 
-    The rest is the robot model and all causes, as far as there are any; the causes alone if all
-    are errors of the measurement.
+    If all causes are certain errors of the measurement, one more stage has these taken out. Else
+    there is one with the robot model, if there is one, and one with all causes, if any.
     """
     rows = [('today', inputs.before_mm), ('with the zero-offsets', inputs.after_mm)]
     if inputs.causes_mm is not None and all_taken_out(inputs.found):
@@ -242,11 +246,12 @@ def _action(
     after: float,
     offsets: list[JointOffset],
 ) -> tuple[Literal['set', 'wait', 'nothing'], str]:
-    """Return the action, and a sentence with the reason unless it is 'set', else ''.
+    """Return the action of a report, and a sentence with its reason ('' for 'set').
 
-    'wait' for a bad judgement, or a cause of the arm that happened at a moment; 'nothing'
-    without an identifiable offset, or if the mean error before is below `NOTICEABLE_GAIN`
-    (1.1) times that after. ``before, after``: mean errors, mm.
+    'wait' if the fit's judgement is bad, or if a cause of the arm happened at one moment;
+    'nothing' if no offset is identifiable, or if the mean error before is below
+    `NOTICEABLE_GAIN` (1.1) times that after; else 'set': set the offsets. ``effects``: causes
+    found, [] if there are none; ``before, after``: mean errors without and with offsets, mm.
     """
     if judgement.mood == 'bad':
         return 'wait', f'Set nothing yet. {judgement.headline}'
@@ -295,9 +300,10 @@ def _noise(inputs: Inputs) -> tuple[SensorNoise, ...]:
 def _mood(inputs: Inputs, loads_model: bool, may_be_good: bool) -> Mood:
     """Return the mood of a report: 'good', 'caution' or 'bad'.
 
-    'bad' if the fit's is; 'good' only if fit and discovery are good, no data disagree, and
-    there are no causes but those in a robot model to be loaded. ``may_be_good``: whether poses
-    were held out and the action is not to wait; else it is 'caution' at best.
+    'bad' if the fit is judged bad. 'good' only if the fit's data do not disagree, a discovery, if
+    there is one, is judged good, and either the fit is judged good and there are no causes, or all
+    causes are in a robot model to be loaded (``loads_model``). ``may_be_good``: whether poses were
+    held out and the action is not to wait; if not, 'caution' at best.
     """
     fit, found = inputs.judgement, inputs.found
     if fit.mood == 'bad':

@@ -78,10 +78,11 @@ def summary_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def differing(values: FloatArray, level: float) -> list[int]:
     """Indices of the values (n,) that do not belong to the normal distribution of the others.
 
-    ``level``: probability that any is named if none differs; simulated for 5 to 200 values. The
-    generalised extreme Studentised deviate test: values are taken out one by one, up to a third of
-    them, so that several do not hide each other (B. Rosner, "Percentage points for a generalized
-    ESD many-outlier procedure", Technometrics 25, 1983, equation 2.5).
+    ``level``: probability that any is named if none differs; checked by simulation for 5 to 200
+    values. By the generalised extreme Studentised deviate test: values are taken out one by one,
+    up to a third of them, so that several do not hide each other (B. Rosner, "Percentage points
+    for a generalized ESD many-outlier procedure", Technometrics 25, 1983, equation 2.5). [] for
+    fewer than 4 values.
     """
     remaining = list(range(len(values)))
     removed: list[int] = []
@@ -102,8 +103,8 @@ def differing(values: FloatArray, level: float) -> list[int]:
 def _shown(joint: Mapping[str, Any], key: str) -> str:
     """Return a joint's value with sign and unit: '+0.0123 deg'.
 
-    ``joint``: a row of `_joint`; ``key``: name of the value without its unit, such as
-    'median'.
+    ``joint``: a row of `_joint`, in which the value is not None; ``key``: name of the value
+    without its unit, such as 'median'.
     """
     return f'{joint[key + "_" + joint["unit"]]:+.4f} {joint["unit"]}'
 

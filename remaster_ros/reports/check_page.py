@@ -53,8 +53,8 @@ def write_check_page(
 def _draw(trend: Trend) -> Figure:
     """Draw each joint's change over the checks, at the tool, mm.
 
-    ``trend``: content, changes and names of the checks, as of `write_check_page`. Only joints
-    whose change could be detected have a panel.
+    ``trend``: (output of ``remaster check --json``, changes, m, (T, k), names of the T checks), as
+    for `write_check_page`. Only joints whose change could be detected have a panel.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator

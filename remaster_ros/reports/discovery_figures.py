@@ -69,7 +69,8 @@ def discovery_figures(discovery: Discovery) -> dict[str, Callable[[Discovery], F
 def gain(discovery: Discovery) -> Figure:
     """Draw the error distributions before and after, and each sensor's noise.
 
-    Noise that the readings of a pose share is apart from that within a pose, if it is known.
+    Noise shared by all readings of a pose and noise within a pose have separate bars, if the
+    session can tell them apart.
     """
     figure = Figure(figsize=(WIDTH_IN, 2.6), layout='constrained')
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
@@ -194,7 +195,7 @@ def _binned(ax: Axes, x: FloatArray, y: FloatArray, color: str) -> None:
 
 
 def causes(discovery: Discovery) -> Figure:
-    """Draw each cause of a joint, and each step of anything else, with the data it explains.
+    """Draw each cause of a joint, and each step of a sensor, marker or base, with its data.
 
     At most 16 panels (twice `MOST_CAUSES`). The sizes of all other causes are in one panel.
     """
@@ -290,10 +291,11 @@ def _step(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
 def _driver(
     context: Context, candidate: Candidate, features: FloatArray
 ) -> tuple[str, FloatArray, float]:
-    """Return label, values (n,) and shown unit of the quantity that a cause depends on.
+    """Return label, values (n,) and scale of the quantity that a cause depends on.
 
-    The unit is the value that counts as one of the shown. If the quantity has several numbers,
-    the values are the first column of ``features``, (n, p), those of the cause's parameters.
+    The scale is the value of one unit of the axis, such as 1 degree in rad. If the cause depends
+    on no single quantity, the values are the first column of ``features``, (n, p): the columns of
+    the cause's p parameters.
     """
     driver = driver_named(context, candidate.driver, candidate.joints[-1])
     if driver is None:
@@ -307,7 +309,7 @@ def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
     """Draw one cause at a joint's angle, in arc minutes, or in mm for a prismatic joint.
 
     Points are residuals without the cause; the line is the posterior mean, the band ± 2 standard
-    deviations. A change is drawn only where it is present.
+    deviations. A change in mid-session is drawn only in rows after it begins, or before it ends.
     """
     data, solution = discovery.residuals, discovery.solution
     all_rows = len(data.context) <= MOST_DRAWN
@@ -393,10 +395,11 @@ def _cause(ax: Axes, discovery: Discovery, candidate: Candidate) -> None:
 def _at_places(
     ax: Axes, at: FloatArray, middle: FloatArray, spread: FloatArray, holes: IntArray
 ) -> None:
-    """Draw an estimate and its band as bars, for a joint that stood only at single places.
+    """Draw an estimate and its band as bars, if the driver has only few separate values.
 
-    ``at``: driver of the rows, sorted, in parts that begin at ``holes``. Draws nothing if any
-    part is wide enough for a line and a band.
+    ``at``: driver of the rows, sorted, (n,); ``middle``, ``spread``: estimate and half width of
+    the band, (n,) each; ``holes``: indices in these at which a part begins after a gap. Draws
+    nothing if any part is wide enough for a line.
     """
     parts = np.split(np.arange(len(at)), holes)
     if any(np.ptp(at[part]) > PLACE * np.ptp(at) for part in parts):
@@ -413,10 +416,10 @@ def _sides(
     band: FloatArray,
     shown: tuple[FloatArray, FloatArray],
 ) -> None:
-    """Draw a cause that depends on the side of approach (1 or -1): points, and level ± ``band``.
+    """Draw a cause that depends on the side of approach (1 or -1): points, and a line a side.
 
-    ``x``, ``effect``, ``band``: side, effect and half width in each row; ``shown``: sides and
-    values of the points.
+    ``x``, ``effect``, ``band``: side, effect and half width of its band in each row, (n,) each;
+    ``shown``: sides and values of the points.
     """
     places, points = shown
     spread_out = places + 0.3 * np.linspace(-1.0, 1.0, len(places))

@@ -34,7 +34,8 @@ def _with_exact_drawing(
 ) -> list[dict[str, Any]]:
     """Copies of rows of zero-offsets, with their std for an arm of exactly nominal geometry.
 
-    It is added as ``std_if_exactly_drawn_deg`` (or ``_mm``) if identifiable and finite.
+    ``rows``: one for each joint. Added as ``std_if_exactly_drawn_deg`` (or ``_mm``); left out for
+    an offset that is not identifiable or whose std is not finite.
     """
     drawn = of_joints(discovery.fit.chain, std_if_exactly_drawn=discovery.std_if_drawn)
     found = []

@@ -135,7 +135,7 @@ def _is_proven(discovery: Discovery, confirmation: Confirmation | None) -> bool:
 def least_seen_m(discovery: Discovery) -> float:
     """Return the smallest RMS displacement of the marker by a cause that would be found, m.
 
-    So large that, over all rows together, it amounts to `DETECTED` standard deviations.
+    It is `DETECTED` times the noise over the square root of the number of measured coordinates.
     """
     numbers = discovery.residuals.errors.size
     return float(DETECTED * discovery.gain.noise_floor_m / np.sqrt(numbers))
@@ -197,7 +197,8 @@ def _result(
 ) -> str:
     """Return sentences on the verdict and the errors on held-out poses.
 
-    ``something_left``: whether there are gross errors, or errors above the noise.
+    ``confirmation``: by another session, or None; ``something_left``: whether there are gross
+    errors, or held-out errors above the noise.
     """
     gain = discovery.gain
     change = ''

@@ -122,7 +122,8 @@ def arm_lines(chain: SerialChain, q: FloatArray, offsets: FloatArray | None = No
 def error_histograms(ax: Axes, before: FloatArray, after: FloatArray) -> None:
     """Draw the distributions of 3-D errors before and after, mm, (n,) each, with their means.
 
-    The axis is logarithmic; errors below the 0.2 % quantile are drawn there.
+    The axis is logarithmic and begins at the 0.2 % quantile of all errors (at least 1e-4 mm);
+    smaller errors count in the first bin.
     """
     both = np.concatenate((before, after))
     floor = max(float(np.quantile(both, 0.002)), 1e-4)

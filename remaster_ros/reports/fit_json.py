@@ -164,10 +164,10 @@ def _orientation(result: FitResult, found: Orientations) -> dict[str, Any]:
 
 
 def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
-    """Return the std of each identifiable offset from positions alone, by joint, deg or mm.
+    """Return the std of each identifiable offset from measured positions alone, deg or mm.
 
-    Keys 'std_positions_deg', and 'std_positions_mm' if there are prismatic joints; None for an
-    infinite std. Without orientations 'std_positions_deg' is {}.
+    {'std_positions_deg': {joint: std}}, and 'std_positions_mm' for prismatic joints; a std is
+    None if infinite. If the fit used no orientations, {'std_positions_deg': {}}.
     """
     found: dict[str, dict[str, float | None]] = {'std_positions_deg': {}}
     information = None if result.orientations is None else result.orientations.information
@@ -183,8 +183,9 @@ def _by_positions(result: FitResult) -> dict[str, dict[str, float | None]]:
 def fit_content(result: FitResult) -> schemas.Fit:
     """Return the content of fit.json, checked against its schema; keys without a value are unset.
 
-    The std of sampled parameters has n - 1 in its denominator; that of offsets includes errors
-    that the model does not have, and lengths and tilts off their drawing.
+    The std of sampled parameters has n - 1 in its denominator. The std of an offset also includes
+    errors that remain after the fit beyond noise, and deviations of link lengths and axis tilts
+    from the drawing.
     """
     draws = result.draws.reshape(-1, result.draws.shape[-1])
     content: dict[str, Any] = {
@@ -296,13 +297,13 @@ def joint_offsets_of(fit: schemas.Fit, chain: SerialChain) -> tuple[FloatArray, 
     Returns
     -------
     offsets, std
-        rad, m for prismatic joints, (k,) each; the std is that of an arm that is exactly its
-        drawing, as predictions use it, and 0 for offsets that are not identifiable.
+        rad, m for prismatic joints, (k,) each; the std is that for an arm of exactly nominal
+        geometry, as predictions use it, and 0 for offsets that are not identifiable.
 
     Raises
     ------
     InputError
-        The offsets are for other joints, in another unit, or beyond any arm's.
+        The offsets are for other joints, in another unit, missing, or larger than a whole turn.
     """
     rows = {row.joint: row for row in fit.joint_offsets}
     joint_names = chain.joint_names

@@ -110,7 +110,7 @@ def _comparison(result: FitResult) -> _Comparison:
 
 
 def _residuals(result: FitResult) -> _Residuals:
-    """Comparison of the residuals with the noise of each sensor, and their structure."""
+    """Comparison of the residuals with each sensor's noise, and tests of what they depend on."""
     unexplained = [check for check in result.noise_checks if check.explained is False]
     unknown = [check for check in result.noise_checks if check.explained is None]
     doubts = [_compared(check) for check in unknown]
@@ -237,9 +237,10 @@ def _left_out(result: FitResult) -> list[str]:
 
 
 def references(result: FitResult) -> tuple[int, list[str]]:
-    """Return the number of rounds of the references, and sentences on changes between them.
+    """Return the number of rounds of reference poses, and sentences on changes they show.
 
-    (0, []) for a session without references.
+    Reference poses are measured again and again in a session, to see if the set-up changes.
+    (0, []) for a session without.
     """
     if result.session.references is None:
         return 0, []
@@ -294,9 +295,10 @@ def _mean_errors_mm(result: FitResult, validated: bool) -> tuple[float, float]:
 
 
 def _structure(result: FitResult) -> list[str]:
-    """Return sentences on what the residuals depend on, each with its probability by chance.
+    """Return sentences on what the residuals were found to depend on, with probabilities.
 
-    [] if they depend on nothing found, or were not tested.
+    Each with the probability of such a dependence by chance. [] if none was found, or if it was
+    not tested.
     """
     found = result.structure.found if result.structure is not None else ()
     tests = [(test.words(result.session.timed), test.chance) for test in found]
@@ -304,7 +306,7 @@ def _structure(result: FitResult) -> list[str]:
 
 
 def _widening(result: FitResult) -> list[str]:
-    """Sentences on the effect of unmodelled errors on the intervals; [] without such errors."""
+    """Sentences on how errors that remain beyond noise widen the intervals; [] without such."""
     lines = []
     if np.any(result.widening > 1.0):
         lines.append(

@@ -56,7 +56,7 @@ class View3D(NamedTuple):
 
     @property
     def data(self) -> str:
-        """`picture` as JSON, gzip-compressed and in base64 for the page."""
+        """Data of the 3-D view (`picture`) as JSON, gzip-compressed and in base64 for the page."""
         return compressed(json.dumps(self.picture, separators=(',', ':'), allow_nan=False))
 
     @property
@@ -127,7 +127,7 @@ def _rounded(points: FloatArray) -> Any:
 
 
 def _point_texts(result: FitResult, shown: IntArray) -> list[str]:
-    """Return a text for each shown row: its numbers, sensor, and errors before and after, mm.
+    """Return a text for each shown row: observation, pose, sensor, errors before and after, mm.
 
     ``shown``: indices of the rows.
     """
@@ -153,9 +153,11 @@ def _round_factor(factor: float) -> int:
 
 
 def accuracy_rows(accuracy: Accuracy) -> list[dict[str, Any]]:
-    """Return a table row for each split and metric, with the reason if there is no number.
+    """Return a table row for each split and metric of a fit's accuracy.
 
-    Validation first, if held out; metrics at random configurations once, with split 'any'.
+    Each has the metric before and after, None without a value, and ``why`` with the reason or ''.
+    Validation first, if poses were held out; metrics at random configurations once, with split
+    'any'.
     """
     rows = []
     for split in ('validation', 'optimization'):

@@ -65,7 +65,7 @@ def read_causes(
 def earlier_pairs(
     path: str | os.PathLike[str], joint_names: Sequence[str] = (), created: str = ''
 ) -> tuple[tuple[Named, Named], ...]:
-    """Pairs of causes and look-alikes of a discovery.json, open ones and decided ones.
+    """Pairs (cause, look-alike) of a discovery.json: those decided, then those still open.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def _read(path: str | os.PathLike[str], joint_names: Sequence[str]) -> Discovere
 def _separable(effect: FoundEffect) -> list[LookAlike]:
     """Return the look-alikes of an effect that further poses can separate from it.
 
-    Not those that displace every pose alike (`same`), or of whose shapes the effect is one
-    (`general`).
+    Left out are look-alikes that displace the marker exactly as the effect does (`same`), and free
+    forms such as splines, of which the effect is one possible shape (`general`).
     """
     return [other for other in effect.confusable_with if not other.same and not other.general]

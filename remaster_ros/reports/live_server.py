@@ -177,8 +177,9 @@ class LiveServer:
     def refusal(self, seen: SeenView) -> str:
         """Return the reason to refuse a command given on an outdated view; '' if it is current.
 
-        Refused are views over 3 s old (`FRESH_S`), used before, or of another state. One that
-        is accepted counts as used.
+        A view is outdated if it is over 3 s old (`FRESH_S`), if a command on it or on a later
+        one was accepted before, or if its mark is not that of the present state. If the result
+        is '', the view counts as used.
         """
         issued = dict(self._issued).get(seen.view, float('-inf'))
         if time.monotonic() - issued > FRESH_S or seen.view <= self._used:
@@ -190,10 +191,10 @@ class LiveServer:
         return ''
 
     def command(self, name: str) -> str:
-        """Return the command to pass to `send` for one of the page.
+        """Return the command to pass to `send` for a command of the page.
 
-        'confirm' becomes 'confirm/NAME' with the plan's name, '' if the view has no plan;
-        others are unchanged.
+        'confirm' becomes 'confirm/NAME' with the name of the view's plan, or '' if the view has
+        no plan; other commands are unchanged.
         """
         if name != CONFIRM:
             return name

@@ -156,8 +156,8 @@ class LiveView:
     def _end(self, end: events.ConfigurationEnded, now_s: float) -> None:
         """Process the end of a configuration: keep its residuals if it was recorded, even in part.
 
-        They are dropped if it was not seen to settle. Any result but 'recorded' gives a
-        message.
+        They are dropped otherwise, or if no event told before that the configuration settled.
+        Any result but 'recorded' adds a message. ``now_s``: present time, s.
         """
         recorded = end.result in ('recorded', 'partial')
         q = self._open.pop((end.stamp, end.solution), None)
@@ -167,7 +167,10 @@ class LiveView:
             self._messages.append((now_s, _clip(f'configuration {end.result}: {end.reason}')))
 
     def _add_message(self, body: events.State | events.Event, now_s: float) -> None:
-        """Add a message on a failed solution, stop, halt or change; other events add none."""
+        """Add a message on a failed solution, the arm stopped or halted, or a changed set-up.
+
+        Also if a halt is cleared; other events add none. ``now_s``: present time, s.
+        """
         match body:
             case events.SolutionFailed(reason=reason):
                 text = f'configuration failed: {reason}'
@@ -361,7 +364,8 @@ class LiveView:
     def _precision_table(self) -> dict[str, Any]:
         """Return the offsets' standard deviations, degrees, at the last 400 looks (`MOST_POINTS`).
 
-        With the number of configurations and the time, minutes, at each; None if unknown.
+        A look is a fit of the data so far. With the number of configurations and the time,
+        minutes, at each; None for unknown values.
         """
         looks = self._precision.looks[-MOST_POINTS:]
         return {
@@ -406,7 +410,10 @@ class LiveView:
         }
 
     def _confirmation(self) -> dict[str, Any] | None:
-        """Return the plan that the planner shows, and its page's address; None without one."""
+        """Return the plan shown for confirmation, with its page's address; None without a plan.
+
+        With whether it is confirmed, and the reason if its page is not served.
+        """
         plan, page = self.plan_to_show()
         if not plan:
             return None
@@ -497,7 +504,7 @@ def _clip(text: str, longest: int = LONGEST_TEXT) -> str:
 
 
 def _as_sentence(text: str) -> str:
-    """Text with a capital letter and a full stop; '' for none."""
+    """Text with its first letter capital and a full stop added; '' for an empty text."""
     return f'{text[:1].upper()}{text[1:]}.' if text else ''
 
 

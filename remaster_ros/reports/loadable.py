@@ -56,8 +56,8 @@ _ALONE = 'only zero-offsets are corrected here'
 def geometry_of(result: FitResult) -> GeometryModel | None:
     """Return the lengths and tilts estimated from a fit's session; None without an estimate.
 
-    Its errors are computed with the texts of the files to load: URDF with offsets alone, and
-    robot model.
+    Their errors are those of the robot model's file as written; the errors of the drawing are
+    those of the URDF with offsets alone. Cached.
     """
     if result.found is None:
         return None
@@ -80,11 +80,11 @@ class Uncertainty(NamedTuple):
 
 
 def uncertainty(result: FitResult) -> Uncertainty:
-    """Return a fit's uncertainty of its offsets, for an arm that is not exactly its drawing.
+    """Return a fit's uncertainty of its offsets, for an arm that may differ from its drawing.
 
-    Lengths and tilts within the tolerance of the drawing may change an offset without any
-    residual. Without an estimate of them, and for offsets that are not identifiable, it is the
-    uncertainty of an arm that is exactly its drawing.
+    Lengths and tilts off their drawing may change an offset without any residual: their effect is
+    added. It is not added to offsets that are not identifiable, or if lengths and tilts cannot be
+    estimated.
     """
     drawn = Uncertainty(result.joint_offsets_std, result.joint_offsets_interval95)
     geometry = geometry_of(result)
@@ -123,8 +123,8 @@ def model_text(result: FitResult, geometry: GeometryModel) -> str:
 def compensation_text(result: FitResult, result_sha256: str) -> str:
     """Return the text of compensation.json of a fit.
 
-    With lengths and tilts only if commands corrected for them make held-out errors clearly
-    smaller: near singularities no command reaches the poses that they require.
+    It has lengths and tilts only if commands corrected for them make held-out errors clearly
+    smaller (near singularities no command may reach a corrected pose), else zero-offsets alone.
     ``result_sha256``: of fit.json.
     """
     geometry, rows = geometry_of(result), result.measurements
@@ -165,8 +165,9 @@ def applied(discovery: Discovery, widening: float, result_sha256: str) -> dict[s
 def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
     """Return the arm that compensation.json describes: with all effects, or zero-offsets alone.
 
-    With all effects if `holds_everything`. Causes and zero-offsets belong together: without
-    the causes, the zero-offsets are those fitted without them, perhaps with lengths and tilts.
+    With all effects if `holds_everything`. Else with the zero-offsets that are fitted without
+    causes of the arm (`Discovery.alone`); lengths and tilts, if estimated, then only add to the
+    expected error. ``widening``: factor on predicted uncertainties, used with all effects.
     """
     if holds_everything(discovery):
         described = _arm_with_effects(discovery)
@@ -191,8 +192,9 @@ def compensation_of(discovery: Discovery, widening: float) -> CorrectedArm:
 def holds_everything(discovery: Discovery) -> bool:
     """Return whether compensation.json has all effects of the model, not zero-offsets only.
 
-    If the model has effects, its correction converges (slope below 1), and its mean error on
-    held-out poses is smaller at 0.001 mm, or no poses were held out.
+    It has if the model has effects, if its correction converges (slope below 1), and if its mean
+    error on held-out poses, rounded to 0.001 mm, is smaller than with offsets alone, or no poses
+    were held out.
     """
     offsets_error = _held_out_mean(discovery, errors_to_load(discovery)['offsets'])
     every = _held_out_mean(discovery, errors_to_load(discovery)['everything'])
@@ -211,9 +213,9 @@ def _arm_with_effects(discovery: Discovery) -> CorrectedArm:
 def errors_to_load(discovery: Discovery) -> dict[str, FloatArray]:
     """Errors of all rows with each loadable file, by the names of `Loadable`, m, (n, 3).
 
-    Each is computed with the text of the file, written or not. Errors of the measurement that the
-    file does not contain are taken out: the certain ones, and for compensation.json all.
-    'geometry' is missing without an estimate; 'everything' is NaN if its correction does not
+    Each is computed with the text of the file, even if that is not written. Errors of the
+    measurement are taken out first: the certain ones, for 'everything' all. 'geometry' is missing
+    if lengths and tilts cannot be estimated; 'everything' is NaN if its correction does not
     converge.
     """
     offsets_fit, fit, candidates = discovery.alone, discovery.fit, discovery.solution.candidates
@@ -256,7 +258,9 @@ def _held_out_mean(discovery: Discovery, errors: FloatArray) -> float:
 def loadable(discovery: Discovery) -> list[Loadable]:
     """Results that a robot can load, the simplest first, with their mean errors on held-out poses.
 
-    ``better``: than all before it, at 0.001 mm.
+    ``better`` of a result is True if its error, rounded to 0.001 mm, is smaller than those of the
+    simpler results that are worth loading; for 'geometry' also `Discovery.loads_geometry` is
+    required. False without held-out poses.
     """
     files = {
         'offsets': f'{APPLY_FOLDER}/{URDF_FILE}',
@@ -281,7 +285,11 @@ def loadable(discovery: Discovery) -> list[Loadable]:
 
 
 def _remarks(discovery: Discovery) -> list[str]:
-    """Remarks on the effects that the files with zero-offsets do not correct, a line each."""
+    """Remarks for the files with zero-offsets, a line each: which effects they correct or not.
+
+    On errors of the measurement that are taken out or not, and on effects of the arm that these
+    files do not correct, with the file that does; [] without effects.
+    """
     measured = [effect for effect in discovery.effects if effect.of_measurement]
     in_model = [effect for effect in discovery.effects if effect.in_robot_model]
     not_in_model = [effect for effect in discovery.effects if effect not in (*measured, *in_model)]

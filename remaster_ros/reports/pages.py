@@ -37,9 +37,9 @@ from remaster_ros.session.files import make_folder, write_atomically
 
 
 def law(effect: FoundEffect) -> str:
-    """Equation and source of an effect; '' if it has none.
+    """Equation and source of an effect as text; '' if it is of no known name.
 
-    For an effect without a name, those of its form: a step if it came at a moment.
+    For an effect without a name that happened at one moment, those of a step.
     """
     happened = effect.name == NO_NAME.name and effect.moment_s is not None
     kind = EFFECTS.get('step' if happened else effect.name)

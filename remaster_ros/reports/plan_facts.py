@@ -141,8 +141,8 @@ def _row(plan: RecordedPlan, split: str, words: str) -> PlannedRow:
 def _stds(inputs: Inputs, plan: RecordedPlan) -> tuple[StdRow, ...]:
     """Return the expected and the fit's standard deviation of each joint's offset, deg or mm.
 
-    The fit's is that of the model alone, for an arm exactly as drawn; None if not
-    identifiable. () if none were expected.
+    The fit's is that for an arm exactly as drawn, without errors that remain beyond noise, as the
+    expected one is; None if the offset is not identifiable. () if none were expected.
     """
     if plan.expected is None:
         return ()

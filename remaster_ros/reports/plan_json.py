@@ -63,7 +63,11 @@ def plan_to_dict(plan: CollectionPlan) -> dict[str, Any]:
 
 
 def _moving(plan: CollectionPlan, design: MovingDesign) -> dict[str, Any]:
-    """Return the key moving of a plan: times of its curves, share in sight, largest speeds."""
+    """Return the key moving of a plan, on measuring in motion along curves.
+
+    Durations of the curves, s; share of the time in which markers are in sight; largest joint and
+    tool speeds; expected precision.
+    """
     chain = plan.tour.chain
     joint, speed = design.max_joint_speed
     return {
@@ -185,9 +189,9 @@ def _moving_text(plan: CollectionPlan, design: MovingDesign, settings: DesignSet
 
 
 def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
-    """Return a plan without paths as a dict: those keys of `plan_to_dict` that need no paths.
+    """Return a plan before paths are planned as a dict: keys of `plan_to_dict` that need no paths.
 
-    Its splits have 'configurations' in place of 'visits'.
+    Its splits have 'configurations' in place of 'visits'. ``expected``: expected precision.
     """
     return {
         'configurations': sum(tour.configurations.values()),
@@ -204,7 +208,7 @@ def outlook_to_dict(tour: Tour, expected: Expected) -> dict[str, Any]:
 
 
 def outlook_text(tour: Tour, expected: Expected) -> str:
-    """A plan without paths as text, one subject a line: counts and expected precision."""
+    """A plan before paths are planned as text, a subject a line: counts and expected precision."""
     counts = {split: (tour.configurations[split], poses) for split, poses in tour.poses.items()}
     fitted, held_out = counts[FITTED], counts.get(HELD_OUT, (0, 0))
     lines = [
@@ -255,7 +259,11 @@ def _expected_std(
 
 
 def _separated_text(design: SeparatingDesign) -> list[str]:
-    """Configurations that separate causes, in lines: number, each pair and whether decided."""
+    """Return lines on the configurations of a plan that separate causes.
+
+    Their number; a line for each pair of causes, with how far apart these are, in standard
+    deviations, and whether that decides between them; then what poses do not separate.
+    """
     count = sum(len(pose.solutions) for pose in design.poses)
     lines = [f'of these to separate causes: {_at_poses(count, len(design.poses))}']
     for pair in design.pairs:
@@ -274,9 +282,9 @@ def minutes_text(seconds: float) -> str:
 
 
 def missed_goal(plan: CollectionPlan) -> str:
-    """Return a sentence that an optimal design does not reach its goal, with a remedy.
+    """Return a sentence that a plan's optimal design misses its goal of precision, with remedy.
 
-    '' if it reaches it, or if the plan has no such design.
+    '' if it reaches the goal, or if the plan was not made by an optimal design.
     """
     if plan.design_result is None or plan.goal_reached:
         return ''

@@ -189,10 +189,10 @@ def _chain(inputs: Inputs) -> SerialChain:
 
 
 def _how_sure(inputs: Inputs, answer: Answer) -> list[str]:
-    """Return further remarks on the fit, the model with causes, and the other session.
+    """Return further remarks on the fit, the discovery and the other session, a line each.
 
-    A line each. Left out are findings that the causes answer, and disagreements, which are
-    listed elsewhere.
+    Left out are remarks on the fit if the answer uses the causes, findings of the fit if there is
+    a discovery, and disagreements, which the report lists elsewhere.
     """
     judgement, found = inputs.judgement, inputs.found
     answered = judgement.findings if found is not None else []
@@ -216,7 +216,10 @@ def measured_when(inputs: Inputs) -> str:
 
 
 def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
-    """Return the number of gross errors among the rows to fit, in the fit that the answer uses."""
+    """Return the number of gross errors among the rows that were not held out.
+
+    By the discovery if the answer uses its causes; else the rows that the fit left out.
+    """
     m = inputs.session.measurements
     left_out = inputs.gross if answer.uses_causes else list(inputs.fit_left_out)
     return int(np.sum(~m.is_validation & np.isin(m.observation, left_out)))
@@ -263,8 +266,9 @@ def _copy_apply(
 ) -> None:
     """Copy the files of the action to the folder's ``apply``, so that the report is complete.
 
-    Those of an earlier report are removed first. ``source``: folder with the files; ``model``,
-    ``compensation``: paths, None without such a file. Raises InputError if one cannot be read.
+    Those of an earlier report are removed first. ``source``: folder of the files, except of robot
+    model and compensation.json, whose paths are ``model`` and ``compensation`` (None if there is
+    none). Raises InputError if a file cannot be read.
     """
     make_folder(folder / APPLY_FOLDER)
     for name in ALL_FILES:

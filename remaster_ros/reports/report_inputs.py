@@ -70,7 +70,7 @@ class Inputs:
 
     @cached_property
     def fit_left_out(self) -> dict[int, str]:
-        """Reason by ``observation`` for each row that was not fitted."""
+        """Rows that the fit left out as gross errors: number (``observation``) -> reason."""
         return {row.observation: row.why for row in self.fit.left_out}
 
     @property
@@ -190,8 +190,7 @@ def _model(
 def errors_with_model_mm(session: Session, urdf: str) -> FloatArray:
     """Return the 3-D error of each row with a robot model, mm, (n,).
 
-    ``urdf``: its text. As `errors_with_urdf`: registrations and markers are fitted, offsets
-    are 0.
+    ``urdf``: text of the model. Registrations and markers are fitted to it, with offsets of 0.
     """
     return lengths_mm(errors_with_urdf(session, urdf))
 

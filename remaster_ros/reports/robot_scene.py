@@ -100,11 +100,11 @@ def robot_scene(cell: Workcell, scene: PlanningScene) -> RobotScene:
 def arm_surfaces(
     visuals: Sequence[Visual], bodies: Sequence[Body], mesh_parts: MeshParts
 ) -> tuple[list[Surface], list[str]]:
-    """Return surfaces of an arm and its surroundings, and notes on parts not drawn as described.
+    """Return surfaces of an arm and its surroundings, and notes on geometry that cannot be read.
 
-    Of the ``bodies`` of the collision checks, tool, markers and obstacles are drawn, and the
-    links whose visual geometry is missing or cannot be read. ``mesh_parts``: reads a mesh by
-    its name; raises InputError for a missing one.
+    Links are drawn by their ``visuals``; a link of which any is missing or cannot be read, by its
+    bodies. Of ``bodies``, those of the collision checks, tool, markers and obstacles are drawn,
+    too. ``mesh_parts``: function that reads a mesh by its name; InputError for a missing one.
     """
     surfaces: list[Surface] = []
     missing: dict[str, None] = {}

@@ -94,7 +94,10 @@ class JointOffset(Struct):
 
     @property
     def std_if_exactly_drawn(self) -> float:
-        """Std for an arm of nominal geometry, rad or m; ``std`` in older files."""
+        """Standard deviation for an arm of exactly nominal geometry, rad or m.
+
+        If the file has none, as older files: that of `mean_and_std`.
+        """
         std = getattr(self, f'std_if_exactly_drawn_{self.unit}')
         if std is UNSET:
             return self.mean_and_std[1]
@@ -180,10 +183,11 @@ class Judgement(Struct):
 
 
 class Imitation(Struct):
-    """Length or tilt that changes a joint's offset most: by ``deg`` if it is off by the tolerance.
+    """Length or tilt that changes a joint's offset most, and the change if it is off its drawing.
 
-    ``joint`` is the joint's name; ``link_length`` ``of`` 2 is that of the link after joint 2. For
-    a prismatic joint the change is ``mm``, and ``deg`` is null.
+    ``deg`` is the change of the offset of ``joint`` (a name) by a length or tilt that is off by
+    the tolerance; for a prismatic joint it is ``mm``, and ``deg`` is null. ``link_length`` ``of``
+    2 is that of the link after joint 2.
     """
 
     joint: str
@@ -195,7 +199,7 @@ class Imitation(Struct):
 
     @property
     def as_angle(self) -> float:
-        """Change as an angle, rad; a length over `LEVER_M`, 0.25 m."""
+        """Change of the joint's offset as an angle, rad; a length is divided by 0.25 m."""
         if self.deg is not None:
             return math.radians(self.deg)
         assert self.mm is not UNSET
@@ -203,7 +207,7 @@ class Imitation(Struct):
 
     @property
     def shown(self) -> str:
-        """Change with its unit, to three decimals: '0.012 deg'."""
+        """Change of the joint's offset with its unit, to three decimals: '0.012 deg'."""
         return f'{self.mm:.3f} mm' if self.deg is None else f'{self.deg:.3f} deg'
 
 
@@ -265,9 +269,10 @@ class Fit(Struct):
 class Loadable(Struct):
     """A result that a robot can load, and the mean 3-D error on held-out poses with it.
 
-    'offsets' alone, 'geometry': all link lengths, axis tilts and zero-offsets together, or
-    'everything' in the model. ``better`` than all before it, or there is no reason to load it.
-    ``file`` is '' if no file contains it.
+    ``result``: 'offsets' alone, 'geometry' (all link lengths, axis tilts and zero-offsets) or
+    'everything' that the model has. ``better``: whether its error is smaller than those of the
+    simpler results worth loading; if not, there is no reason to load it. ``file`` is '' if no
+    file contains it.
     """
 
     result: Literal['offsets', 'geometry', 'everything']
@@ -286,9 +291,10 @@ class NoiseOfDiscovery(Struct):
 
 
 class OffsetBefore(Struct):
-    """Zero-offset of a joint without the effects; None if nothing bounds it.
+    """Zero-offset of a joint in the fit without causes, with its standard deviation.
 
-    Units of prismatic joints as in `JointOffset`.
+    The standard deviation is None if the data do not determine the offset. Units of prismatic
+    joints as in `JointOffset`.
     """
 
     joint: str
@@ -324,10 +330,10 @@ class JointCovariance(Struct):
 class Discovered(Struct):
     """Content of discovery.json.
 
-    A zero-offset has two meanings: beside the causes it is the joint's error where those are zero,
-    for a controller that loads them too (``joint_offsets_after``); without them it is the mean
-    error over the configurations measured, for one that loads offsets alone
-    (``joint_offsets_alone``).
+    Zero-offsets are of two kinds. ``joint_offsets_after`` are fitted together with the causes, for
+    a controller that corrects these, too. ``joint_offsets_alone`` are fitted without causes of the
+    arm, for a controller that takes offsets alone: they contain the mean effect of the causes over
+    the configurations measured.
     """
 
     format: str

@@ -73,7 +73,7 @@ def not_counted(gross: int) -> str:
 
 
 def times_smaller(before: float, after: float) -> str:
-    """Return a text such as '9.0 times smaller', on an error before and after."""
+    """Return the ratio of an error before to that after as text, such as '9.0 times smaller'."""
     times = before / max(after, 1e-9)
     return f'{times:.{1 if times < 10 else 0}f} times smaller'
 
@@ -114,7 +114,8 @@ def size_words(effect: FoundEffect) -> str:
 def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
     """Return the name of a cause's look-alike, beginning with a small letter.
 
-    'joint 2 alone' if it is the same effect of fewer joints.
+    ``effect``: the cause; ``other``: its look-alike. 'joint 2 alone' if that is the same effect of
+    fewer joints.
     """
     fewer = part_words(effect.name, effect.joints, other.name, other.joints)
     return fewer or sentence_case(other.title or called(other.name, other.joints))
@@ -147,7 +148,8 @@ def std_remark(tolerance_m: float) -> str:
 def as_drawn(geometry: FittedGeometry, imitations: Sequence[Imitation]) -> str:
     """Return a clause on what links off their drawing add to the offsets' standard deviations.
 
-    ``imitations``: lengths or tilts to name, each with its effect on a joint.
+    ``imitations``: lengths or tilts to name, each with the change of a joint's offset by it if it
+    is off by the tolerance of ``geometry``.
     """
     moved = '; '.join(
         f'{"link" if imitation.cause == "link_length" else "the axis of joint"} {imitation.of} is '

@@ -79,7 +79,7 @@ class _Log(Outlet):
 
 @dataclass(frozen=True)
 class Replayed:
-    """Result of the replay of a bag: number of rows, outcomes, and bytes cut off at its end."""
+    """Result of the replay of a bag: numbers of rows and of outcomes, bytes cut off at its end."""
 
     # Number of rows written.
     observations: int
@@ -149,11 +149,11 @@ def record_from_bag(
 
 
 def _takers(cell: Workcell, recorder: SessionRecorder) -> dict[str, Callable[[Any], object]]:
-    """Return the function that takes the messages of a topic, by absolute topic name.
+    """Return by topic the method of the recorder that processes a message of this topic.
 
-    Topics are those of joint states, of a settled arm and of joint solutions; and for each
-    sensor its temperature and its markers, or its poses in place of the markers if it has
-    them.
+    Keys: absolute names of the topics of joint states, of a settled arm and of joint
+    solutions; and for each sensor those of its temperature and of its markers, or of its poses
+    in place of the markers if it has them.
     """
     take: dict[str, Callable[[Any], object]] = {
         '/joint_states': recorder.take_joints,

@@ -163,5 +163,5 @@ class LastCommandFile:
 
 
 def _is_place(values: Sequence[float], joints: int) -> bool:
-    """Whether values are finite numbers, one for each joint."""
+    """Whether values can be joint positions: finite numbers, as many as there are ``joints``."""
     return len(values) == joints and bool(np.isfinite(values).all())

@@ -226,8 +226,9 @@ class AppendFile:
     def append(self, data: bytes) -> None:
         """Append a piece durably.
 
-        Raises DiskError if the disk is full; the file then ends as before. If it cannot be
-        restored to that, it is closed: its end is unknown until it is read again.
+        Raises DiskError if the piece cannot be written, such as to a full disk; the file then
+        ends as before. If what was written of the piece cannot be removed, the file is closed.
+        InputError if it is closed already.
         """
         descriptor = self.descriptor
         with writing(self.path):

@@ -16,9 +16,9 @@ Record = TypeVar('Record', bound=msgspec.Struct)
 
 
 def plain(values: Any) -> Any:
-    """Array as nested lists, or mapping as a dict, whose values stay; for a JSON encoder.
+    """Array as nested lists, or mapping as a dict; for a JSON encoder that calls this for them.
 
-    Raises TypeError for other types.
+    The values in a mapping are not converted. Raises TypeError for other types.
     """
     if isinstance(values, np.ndarray | np.generic):
         return values.tolist()

@@ -80,7 +80,7 @@ def _finish_session(folder: Path, header: SessionHeader, recovery: Recovery) -> 
 
 
 def _note(recovery: Recovery, lost: str) -> None:
-    """Add a loss, one line, to ``recovery``, and mark it as finished; nothing for ''."""
+    """Add a loss, one line, to `lost` of ``recovery``, and set `finished`; nothing if it is ''."""
     if lost:
         recovery.finished = True
         recovery.lost.append(lost)

@@ -348,8 +348,9 @@ class SessionRecorder:
     def take_marker(self, sensor: str, marker: str, message: Any) -> bool:
         """Process a reading (PointStamped or PoseStamped); return whether the marker is seen.
 
-        A position that is not finite is dropped and counted. Of a sensor with several markers, NaN
-        means a hidden marker, and is recorded. Both return False.
+        A position that is not finite is dropped and counted, and False returned. But if the
+        sensor has several markers, a position of NaN alone means a hidden marker: it is
+        recorded as such, and False is returned, too.
         """
         body = getattr(message, 'pose', None)
         point = message.point if body is None else body.position
@@ -404,11 +405,12 @@ class SessionRecorder:
                 self.recording.begin_by_hand(read.stamp_s, np.array(read.q))
 
     def _on_began(self, began: events.RecorderBegan) -> None:
-        """Process the start of a recorder: restart as that of the bag did.
+        """Process the event of a recorder's start that is in a bag: restart as that recorder did.
 
-        The first start in a bag opens nothing; a later one closes the session as stopped and
-        reopens it. The state is then that of the session. A start that only continued changes
-        nothing.
+        The state is restored from the session on the disk. Before that, at each start but the
+        first, the session is closed as stopped and reopened, unless it is closed already.
+        ``began.continued``: the same process has opened a closed session again; then only
+        `from_bag` is set.
         """
         first, self.from_bag = not self.from_bag, True
         if began.continued:
@@ -426,8 +428,8 @@ class SessionRecorder:
     def _on_pose(self, pose: events.PoseAnnounced) -> None:
         """Set the announced pose, and record which of its solutions are unreachable.
 
-        A pose that is neither a reference nor of a registration ends a round of the
-        references: a new change of the set-up is reported.
+        A pose that is neither a reference nor of a registration ends the round of visits to
+        the references: if that shows a new change of the set-up, the change is reported.
         """
         self.recording.announced = pose
         self._failed = [failed for failed in self._failed if failed.stamp == pose.stamp]
@@ -567,9 +569,10 @@ class SessionRecorder:
         return self.required.are_among(self.registration.T_R_N)
 
     def end_reading(self) -> None:
-        """Count and write the outcome of the reading under way, if it is decided by now.
+        """End the reading under way if it is decided by now: count and write its outcome.
 
-        Else nothing happens. Waiting times, refused, accepted and dropped frames are counted.
+        Counted are waiting times, refused and accepted readings, and dropped frames. Nothing
+        happens if no reading is under way, or it is not decided yet.
         """
         ended = self.recording.end(self.registration.T_R_N)
         if ended is None:
@@ -587,10 +590,10 @@ class SessionRecorder:
     def _write_outcome(self, ended: EndedReading) -> None:
         """Write the outcome of a configuration, publish it, and begin the next reading.
 
-        Registers sensors by a registration pose, and looks for changes at a reference. A
-        rejected configuration of a pose that is no longer announced is published only. A
-        reading by hand is written and answered, without an event. Neither begins the next
-        reading.
+        Registers sensors by a registration pose, and looks for changes at a reference. Two
+        cases begin no next reading: a rejected configuration of a pose that is no longer
+        announced is only published, not written; a reading by hand is written and answered,
+        but not published.
         """
         settled, pose = ended.settled, ended.settled.pose
         if ended.result == 'rejected' and pose not in (self.recording.pose, BY_HAND):
@@ -659,7 +662,10 @@ class SessionRecorder:
         self._outlet.state()
 
     def close(self, exit_status: ExitStatus) -> None:
-        """Report changes of the setup and close the session; nothing if it is closed already."""
+        """Report a new change of the set-up at the references, and close the session.
+
+        Nothing happens if it is closed already.
+        """
         if self.journal.closed:
             return
         self._report_change(self.changes.judge(self.registration.T_R_N))

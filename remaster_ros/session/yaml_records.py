@@ -65,8 +65,9 @@ def with_line(text: str, problem: str) -> str:
 def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
     """Return a validation message of msgspec with the line and path of the key in the file.
 
-    For an unknown key with a similar known one, or all known ones. ``text``: of the file;
-    ``record``: its type. Unchanged if the place is not found.
+    ``text``: of the file; ``record``: its type; ``message``: msgspec's. The message on an
+    unknown key ends with a similar known key, or else with all known ones. Another message is
+    returned unchanged if its place is not found in the file.
     """
     match = _AT.search(message)
     steps = re.findall(r'\w+|\[[^\]]*\]', match[1]) if match else []
@@ -94,8 +95,9 @@ def explained(text: str, record: type[msgspec.Struct], message: str) -> str:
 def _is_wrong(text: str, record: type[msgspec.Struct], steps: list[str], path: Keys) -> bool:
     """Return whether the entry at a path of a YAML text breaks the record type.
 
-    Tried with the file's other entries of the same dictionaries left out. ``steps``: place in
-    msgspec's message, with [...] for keys of dictionaries; ``path``: keys, as many.
+    To find out which key of a dictionary a message of msgspec is about. ``path``: the keys to
+    the entry; ``steps``: the same in msgspec's message, with [...] in place of a key of a
+    dictionary. The text is validated without the other entries of these dictionaries.
     """
     content = load_yaml(text)
     here = content
@@ -175,8 +177,9 @@ def _hints(record: type) -> dict[str, Any]:
 def out_of_bounds(value: Any, key: str = '', bounds: Bounds = FINITE) -> str:
     """Return the error of the first number that is outside its bounds; '' if none is.
 
-    ``value``: a record or a part of one; ``key``: its dotted key, '' for a whole record;
-    ``bounds``: those of its field.
+    ``value``: a record or a part of one, searched at every level; ``key``: its dotted key, ''
+    for a whole record; ``bounds``: of the numbers in ``value``, unless it is a record, whose
+    fields have their own.
     """
     if isinstance(value, float):
         return bounds.problem(key, value)

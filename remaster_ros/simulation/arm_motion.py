@@ -164,8 +164,8 @@ class Motion:
 
         ``waypoints``: at increasing times from ``start_s``, above 0; the last position is
         held. ``reference_now``: position and velocity of the trajectory at ``start_s``, (k,)
-        each; None if it begins at the arm's own. Of the motion before, the last 16 pieces are
-        kept.
+        each; None if it begins at the arm's own. Of the motion before ``start_s``, only the
+        last 16 parts between waypoints are kept.
         """
         # A later trajectory replaces the future of the former one.
         past = [r for r in self._responses if r.start_s <= start_s] or self._responses[:1]
@@ -188,7 +188,7 @@ class Motion:
     def at(self, t: float) -> tuple[FloatArray, FloatArray]:
         """Joint positions (rad) and velocities (rad/s) at world time t, s, (k,) each.
 
-        Before the oldest kept piece: those at its beginning.
+        For times before the oldest part of the motion that is kept: those at its beginning.
         """
         for response in reversed(self._responses):
             if response.start_s <= t:

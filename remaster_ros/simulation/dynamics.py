@@ -57,7 +57,7 @@ class CameraTiming:
 
 @dataclass(frozen=True, eq=False)
 class Dynamics:
-    """Motion that encoders do not see: lag, friction, elasticity, a mode; timing of cameras."""
+    """Motion that encoders do not see: lag, friction, elasticity, vibration; timing of cameras."""
 
     lag_s: FloatArray  # Delay of each joint's reported position, s, (k,)
     windup_rad: FloatArray  # Largest wind-up by friction, rad or m, (k,)
@@ -74,8 +74,9 @@ class Dynamics:
     ) -> Dynamics:
         """Random dynamics of an arm, with random timing of a camera for each sensor.
 
-        ``scale``: factor on lags, wind-up and softness, 1 for sizes of real machines; the
-        mode's frequency falls with its root. Camera timing does not depend on it.
+        ``scale``: factor on lags, wind-up and softness, 1 for sizes of real machines. The
+        frequency of the arm's vibration is divided by the root of it; infinite for 0. Camera
+        timing does not depend on it.
         """
         k = len(chain)
         cameras = {
@@ -152,11 +153,11 @@ class LinkSide:
             self._states.popleft()
 
     def at(self, motion: Motion, t: float) -> tuple[FloatArray, FloatArray]:
-        """Added joint angles, rad or m, (k,), and shift of the tool, m, (3,), at world time t, s.
+        """Angles to add to the reported ones, (k,), and shift of the tool, (3,), at a time t.
 
-        The shift is in the robot base frame R. Interpolated between steps; the motion is
-        followed up to this time first. For times before the oldest kept step: the values
-        there.
+        The angles, rad or m, do not contain ``offsets``; the shift, m, by vibration, is in the
+        robot base frame R. Computed along ``motion`` up to world time t if it was not yet, and
+        interpolated between steps. For times before the oldest kept step: the values there.
         """
         self.advance(motion, t)
         after = next((i for i, state in enumerate(self._states) if state[0] >= t), -1)

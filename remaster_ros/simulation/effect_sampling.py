@@ -96,11 +96,12 @@ def draw_effect(
     """Draw a random effect of a kind, with the size `size_m` (see `WorldModel.size_m`).
 
     ``joint``: number of the joint, from 1; None for any. An effect that would have to be
-    larger than plausible is drawn again, up to 30 times (for a joint 30 times its arm's
-    joints): a joint that hardly moves shows no eccentricity. If no draw is plausible and no
-    joint is given, the most visible draw is used. Raises InputError if all draws leave nothing
-    (under 1 µm), if none concerns the joint, if those of the joint would have to be larger
-    than plausible, or if an effect of slides is asked of an arm without them.
+    larger than plausible is drawn again, up to 30 times (with a given joint, 30 times the
+    number of joints): a joint that hardly moves shows no eccentricity. If no draw is plausible
+    and no joint is given, the most visible draw is used. Raises InputError if all draws leave
+    nothing (under 1 µm), if none concerns the joint, if those of the joint would have to be
+    larger than plausible, or if the effect or the joint does not fit: an effect of sliding
+    joints on an arm without them, or one of turning joints only at a joint that slides.
     """
     drawn_from = DrawContext(
         rng, stage.arm.joints, stage.circumstances, stage.distance_m, tuple(stage.markers)
@@ -140,10 +141,11 @@ def draw_effect(
 
 
 def _balanced(stage: WorldModel, effect: HiddenEffect) -> HiddenEffect:
-    """Return an effect of several joints with values such that all joints have the same relation.
+    """Return an effect whose joints' visible parts are in proportion to its drawn values.
 
-    Of the size that a joint's part leaves after the fit to its drawn value; the largest value
-    stays as drawn. Otherwise one of two compliant joints could have no visible part.
+    The visible part of a joint is the size (`WorldModel.size_m`) of its part of the effect;
+    without this, one of two compliant joints could have no visible part. The largest value is
+    that of the largest drawn value.
     """
     sizes = [
         stage.size_m(replace(effect, joints=(joint,), values=np.ones(1)))

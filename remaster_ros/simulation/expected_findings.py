@@ -32,9 +32,10 @@ def causes(effect: HiddenEffect) -> list[Cause]:
 
 
 def _without_name(effect: HiddenEffect) -> Cause:
-    """Cause 'unnamed' that discovery has to report for an effect of an unnamed kind.
+    """Cause that discovery has to report for an effect of a kind without a name.
 
-    With the joints, that of the driver last if it is another, and 'PLACE DRIVER'.
+    Its name is 'unnamed'; the joints are those of the effect, then the joint that drives it if
+    that is another one; the last entry is 'PLACE DRIVER'.
     """
     cell = KINDS[effect.kind]
     joints, driver = effect.joints, cell.driver
@@ -47,8 +48,9 @@ def _without_name(effect: HiddenEffect) -> Cause:
 def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
     """Causes in one entry of the list ``effects`` of a discovery.json, one for each joint.
 
-    One for all joints of a coupling or of an effect without a name. The third part is 'PLACE
-    DRIVER' of an effect without a name, the sensor's name of a sensor's effect, else ''.
+    A coupling, and an effect without a name, are a single cause with all its joints. The last
+    entry of a cause is 'PLACE DRIVER' for an effect without a name, the sensor's name for an
+    error of a sensor, else ''. ``effect``: the entry.
     """
     name, joints = effect['name'], tuple(effect['joints'])
     if name not in NAMED:
@@ -65,8 +67,9 @@ def named_cause(effect: Mapping[str, Any]) -> list[Cause]:
 def answers(found: Cause, hidden: Cause, effect: HiddenEffect) -> bool:
     """Whether a found cause is a right answer to a hidden one, which is a cause of ``effect``.
 
-    The joints must be equal, in order. A hidden effect without a name is found by any cause of
-    no name with the same place and driver, or by a name that its kind accepts.
+    The joints must be equal, in order. Right are an equal cause, a cause without a name with
+    the same place and driver as a hidden one without a name, and any further name that the
+    kind of ``effect`` accepts (a sensor in it must be the right one).
     """
     name, joints, detail = found
     if joints != hidden[1]:

@@ -63,7 +63,8 @@ class TrueArm:
     def deviation(self, t: float) -> Deviation:
         """Deviation of arm and sensors at world time t, s, one row (n = 1).
 
-        During a motion it passes smoothly from that before to that at its end.
+        During a motion it passes smoothly from the deviation at the start of the motion to
+        that at its end.
         """
         move = next((m for m in reversed(self._moves) if m[0] <= t), self._moves[0])
         start_s, end_s, before, after = move
@@ -74,8 +75,8 @@ class TrueArm:
     def marker_in_sensor(self, name: str, t: float, q: FloatArray, marker: str = '') -> FloatArray:
         """Noise-free reading of a marker in the frame N of a sensor, m, (3,), at world time t, s.
 
-        ``name``: of the sensor; ``q``: reported positions, rad or m, (k,); ``marker``: '' for
-        the sensor's first. Raises KeyError for an unknown sensor or marker.
+        ``name``: of the sensor; ``q``: reported positions, rad or m, (k,); ``marker``: name,
+        '' for the first marker of the sensor. Raises KeyError for an unknown sensor or marker.
         """
         sensor, wrong = self._truth.sensors[name], self.deviation(t)
         marker = marker or sensor.marker
@@ -83,7 +84,10 @@ class TrueArm:
         return measured(state, name, sensor, marker, self._truth.markers[marker], wrong)[0]
 
     def _deviation(self) -> Deviation:
-        """Deviation at the last stop, one row (n = 1); effects see all kept stops before it."""
+        """Deviation of arm and sensors at the last stop, one row (n = 1).
+
+        Effects may depend on earlier stops; all that are kept are taken into account.
+        """
         times = np.array(self._times)
         visited = Round(
             q=np.array(self._stops),

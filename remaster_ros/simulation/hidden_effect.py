@@ -169,10 +169,10 @@ Draw = Callable[[str, DrawContext], HiddenEffect]
 
 
 def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> Draw:
-    """Return a draw of a random joint, with one value of ±`largest` with a random sign.
+    """Return a function that draws an effect of a random joint with one value, ±`largest`.
 
-    The joint is one from ``first_joint``, counted from 1, to the last. ``positive``: always
-    +`largest`, if physics has only the positive sign.
+    The joint is one from ``first_joint``, counted from 1, to the last; the sign is random.
+    ``positive``: always +`largest`, if physics has only the positive sign.
     """
     return lambda kind, context: HiddenEffect(
         kind,
@@ -182,15 +182,18 @@ def one_value(largest: float, first_joint: int = 1, positive: bool = False) -> D
 
 
 def no_joint(largest: float) -> Draw:
-    """Return a draw of an effect of no joint with the one value `largest`, without randomness."""
+    """Return a function that draws an effect of no joint with the one value `largest`.
+
+    Nothing in it is random.
+    """
     return lambda kind, context: HiddenEffect(kind, (), np.array([largest]))
 
 
 def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Return a draw of a random sensor's effect: ``size`` values, `largest` times a unit vector.
+    """Return a function that draws an effect of a random sensor with ``size`` values.
 
-    The effect's detail has the sensor's name, ``sensor``, and ``form``, a random one of
-    ``forms``.
+    The values are `largest` times a random unit vector. The effect's detail has the sensor's
+    name, ``sensor``, and ``form``, a random one of ``forms``.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -204,10 +207,11 @@ def of_sensor(largest: float, size: int = 1, forms: tuple[str, ...] = ('',)) -> 
 
 
 def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
-    """Return a draw of an effect of two random joints: one with the error, one that drives it.
+    """Return a function that draws an effect of two random joints.
 
-    The driving joint, from 1, is ``by`` in the effect's detail, and a random one of ``forms``
-    is ``form`` there. Values: two for 'sin/cos', else one; `largest` times a unit vector.
+    One joint has the error, the other drives it: its number, from 1, is ``by`` in the effect's
+    detail, and a random one of ``forms`` is ``form`` there. Values: two for 'sin/cos', else
+    one; `largest` times a random unit vector.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:
@@ -220,10 +224,10 @@ def two_joints(largest: float, forms: tuple[str, ...] = ('',)) -> Draw:
 
 
 def at_some_time(draw: Draw) -> Draw:
-    """Return a draw as ``draw``, with a random time from which on the effect is present.
+    """Return a function that draws as ``draw``, with a random time at which the effect begins.
 
-    ``moment_s`` in the effect's detail, s from the first visit; uniform over 15 to 85 % of the
-    visits' time.
+    That time is ``moment_s`` in the effect's detail, s from the first visit; uniform over 15
+    to 85 % of the visits' time.
     """
 
     def timed(kind: str, context: DrawContext) -> HiddenEffect:
@@ -253,8 +257,8 @@ class Part:
     def of(self, effect: HiddenEffect) -> dict[str, float]:
         """Name and true value, SI units, of the parameter in an effect of one joint and one order.
 
-        {} if the effect does not have it: its detail is another, or the value is 0 to
-        rounding.
+        {} if the effect does not have it: an entry of its detail differs from the ``detail``
+        that the parameter requires, or the value is 0 to rounding.
         """
         if any(effect.detail.get(key) != value for key, value in self.detail.items()):
             return {}

@@ -47,10 +47,10 @@ OF_SLIDES: dict[str, HiddenKind] = {}
 
 
 def in_own_units(effect: HiddenEffect, per_radian: FloatArray) -> HiddenEffect | None:
-    """Convert an effect drawn in rad to the units of its joints; None if they cannot have it.
+    """Effect drawn in rad, converted to the units of its joints: m for those that slide.
 
-    ``per_radian``: equivalent of a radian in each joint's unit, (k,). Effects elsewhere than
-    in a joint's angle are returned as they are.
+    None if such a joint cannot have the effect. ``per_radian``: equivalent of a radian in each
+    joint's unit, (k,). Effects elsewhere than in a joint's angle are returned as they are.
     """
     kind = KINDS[effect.kind]
     by = effect.detail.get('by')
@@ -154,7 +154,7 @@ def _draw_marker_slip(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _about_mean_distance(largest: float) -> Draw:
-    """Return a draw of a random sensor with one value of ±`largest`.
+    """Return a function that draws an effect of a random sensor with one value, ±`largest`.
 
     The detail has ``sensor``, and ``distance_m``, the mean distance of the sensor's markers.
     """
@@ -186,10 +186,11 @@ def _kind(
     name: str = '',
     power: int | None = 0,
 ) -> Callable[[Rule], Rule]:
-    """Decorator that enters a rule, with its kind, into a table by the rule's name or `name`.
+    """Decorator that enters a new `HiddenKind` with the decorated rule into a table.
 
-    Other arguments: as the fields of `HiddenKind`; `answers` are its ``accepted``. The rule
-    itself is returned unchanged.
+    A rule is a function that adds an effect to a deviation; it is returned unchanged. The key
+    is `name`, or the rule's own name if that is ''. Other arguments: as the fields of
+    `HiddenKind`; `answers` are its ``accepted``.
     """
 
     def take(rule: Rule) -> Rule:
@@ -245,8 +246,8 @@ _named('joint_angle', 'joint_angle', _draw_gear, *WAVES, name='gear_periodic', p
 def joint_error_curve(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
     """δq = v Σ a cos(o q + phase), added to ``d.angle`` of the joint; v, rad: the only value.
 
-    ``orders`` o, ``amplitudes`` a and ``phases`` are arrays in the effect's detail; no order
-    is low enough for an eccentricity.
+    ``orders`` o, ``amplitudes`` a and ``phases`` are arrays in the effect's detail. Drawn
+    orders are 4 to 24: an eccentricity has the orders 1 and 2.
     """
     q = (c.q / c.per_radian)[:, e.joints[0] - 1]
     waves = sum(
@@ -604,10 +605,11 @@ def lagging_growth(e: HiddenEffect, d: Deviation, c: Circumstances) -> None:
 
 
 def _draw_guide(largest: float) -> Draw:
-    """Return a draw of a wave of half to one and a half periods along a random joint that slides.
+    """Return a function that draws a sine wave along a random joint that slides.
 
-    The value is `largest`, 0 at joint 1 if nothing slides. The detail has ``axis``, a unit
-    vector across the slide, ``per_m``, rad/m, and ``phase``.
+    Half to one and a half periods over the joint's visited range. The value is `largest`, 0 at
+    joint 1 if nothing slides. The detail has ``axis``, a unit vector across the slide,
+    ``per_m``, rad/m, and ``phase``, rad.
     """
 
     def draw(kind: str, context: DrawContext) -> HiddenEffect:

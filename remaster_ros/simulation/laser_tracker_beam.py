@@ -93,7 +93,8 @@ class Beam:
 
         The beam loses it if it is hidden (looked up at every step while the arm moves, else
         every 0.5 s), outruns the beam, or a large move shakes it. The beam is then not locked,
-        and the aim stays where the reflector was lost. Meant for a locked beam.
+        and the aim stays where the reflector was lost. To be called only while the beam is
+        locked.
         """
         reflector, moving = self.reflector(t), self._world.is_moving(t)
         across_speed = angle_between(self.aim, reflector) * np.linalg.norm(reflector) / STEP_S

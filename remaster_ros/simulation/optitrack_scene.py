@@ -279,11 +279,12 @@ class OptiTrackScene:
         return (t - self._start_s) * (1.0 if timing is None else 1.0 + timing.drift)
 
     def _hidden(self, t: float, tracked: bool) -> int | None:
-        """Flags of the markers that are hidden at world time t, s; None if none is.
+        """Flags of a marker that is hidden at world time t, s; None if none is hidden.
 
-        ``tracked``: whether the line of sight is free: if not, all are hidden, else one
-        (`_hidden_place`). Occlusions are planned here, and their flags and guessed errors
-        drawn.
+        ``tracked``: whether the line of sight is free. If it is not, all markers are hidden,
+        else the one of index ``_hidden_place``. At the beginning of an occlusion its flags,
+        this index, and the error of a guessed position are drawn; after its end the next one
+        is planned.
         """
         start, end = self._occlusion
         if t >= end:

@@ -53,7 +53,7 @@ class FakeArm:
         ``names, points``: as in the message; ``start_s``: stamp of the header, s, 0 for now.
         Returns the reason why the trajectory was dropped, for the log; None if the arm follows
         it. Each move misses its target by a random error, of 20 µrad standard deviation in
-        each joint, the same for all parts with one stamp.
+        each joint; consecutive trajectories with the same stamp are one move, with one error.
         """
         now = self.world.now()
         faults = self.world.faults('robot')

@@ -161,9 +161,10 @@ def choose_robot(
     """Chain of the cell's robot, or of another robot that replaces it in the cell.
 
     ``robot``: name of a shipped URDF or path of a file, None for the cell's; ``base_link,
-    tip_link``: None for those of the cell. The cell is changed in place: its robot, and its
-    held joint if the new robot lacks it or needs none. Raises InputError if there is no such
-    robot, or its URDF is invalid.
+    tip_link``: None for those of the cell, or, with another robot, for its URDF's root and only
+    end. The cell is changed in place: its robot, and its ``held_joint``, which becomes '' if
+    another robot has no such joint or at most six joints. Raises InputError if there is no such
+    robot, its URDF is invalid, or it has several ends and none is named.
     """
     if robot is not None:
         shipped = config_path(f'robots/{robot}.urdf')

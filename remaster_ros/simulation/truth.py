@@ -102,7 +102,8 @@ class SessionTruth:
         """Positions of a marker in a sensor's frame N without noise and effects, m, (..., 3).
 
         True offsets, marker and sensor pose count. ``sensor``: name of the sensor; ``q``:
-        reported joint angles, rad, (..., k); ``marker``: name, '' for the sensor's first.
+        reported joint angles, rad, (..., k); ``marker``: name, '' for the first marker of the
+        sensor.
         """
         true_sensor = self.sensors[sensor]
         points_R = chain.positions(

@@ -219,10 +219,10 @@ class World:
     # What sensors see
 
     def marker_in_sensor(self, sensor: str, t: float, marker: str = '') -> FloatArray:
-        """True position of a marker, '' for the first, in the sensor's frame at time t, m, (3,).
+        """Noise-free position of a marker in the sensor's frame at world time t, s, m, (3,).
 
-        Without noise. The fault ``swapped`` applies to the first marker only. Raises InputError
-        for an unknown sensor.
+        ``marker``: name, '' for the first marker of the sensor, which alone the fault
+        ``swapped`` shifts. Raises InputError for an unknown sensor.
         """
         seen_by = self._sensor(sensor)
         q, shift = self.reported(t)[0], None
@@ -249,11 +249,11 @@ class World:
         return float(self.truth.warming.at(np.array(t)))
 
     def line_of_sight(self, sensor: str, t: float, name: str = '') -> bool:
-        """Whether the sensor sees a marker, '' for the first, at world time t, s.
+        """Whether the sensor sees a marker at world time t, s.
 
-        False if a link is between them, beyond the sensor's acceptance angle from the tool's z
-        axis, and with the faults ``occluded`` and ``intermittent``. Raises InputError for an
-        unknown sensor.
+        ``name``: of the marker, '' for the first one of the sensor. False if a link is between
+        them, beyond the sensor's acceptance angle from the tool's z axis, and with the faults
+        ``occluded`` and ``intermittent``. Raises InputError for an unknown sensor.
         """
         true_sensor, faults = self._sensor(sensor), self.faults(sensor)
         if 'occluded' in faults or in_outage(faults.get('intermittent'), t):

@@ -200,7 +200,8 @@ class WorldModel:
     def seen(self, effects: Sequence[HiddenEffect] = ()) -> FloatArray:
         """Readings of the sensors without noise, each in its own frame N, m, (n, 3).
 
-        Rows as they are recorded: at every configuration one of each marker of each sensor.
+        One row for each configuration, sensor and marker of the sensor, in this order, as a
+        session records them.
         """
         state, wrong = self._true_state(effects)
         points = [
@@ -317,7 +318,7 @@ class WorldModel:
     def of_size(self, effect: HiddenEffect, size_m: float) -> HiddenEffect:
         """Return an effect scaled so that `size_m`, the method, gives the size ``size_m``, m.
 
-        Nearly: three steps for what is not linear.
+        Approximately: it is scaled three times, as the size is not quite linear in the values.
         """
         for _ in range(3):  # all but linear
             effect = effect.scaled(size_m / self.size_m(effect))

@@ -67,7 +67,7 @@ class Pace:
         self._fakes: dict[int, _Participant] = {}
 
     def published(self, stamp_s: float) -> None:
-        """Record that a report of joint states with this stamp, s, is published now."""
+        """Record that a report of joint states with this stamp, s, is published just now."""
         with self._lock:
             self._reports.append((stamp_s, self._clock.now()))
 

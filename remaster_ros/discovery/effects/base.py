@@ -268,9 +268,10 @@ class Effect:
         ) or self.sentence
 
     def remedy_of(self, candidate: Candidate) -> str:
-        """Return the remedy for a candidate of this effect, with its driver filled in.
+        """Return the remedy for a candidate of this effect, with the name of its driver filled in.
 
-        `slide_remedy`, if there is one, if the candidate is about a joint that slides.
+        `slide_remedy`, if there is one, if the candidate is about a joint that slides. Driver:
+        the quantity that the error depends on.
         """
         remedy = (candidate.slide and self.slide_remedy) or self.remedy
         return remedy.format(driver=candidate.driver.replace('_', ' '))

@@ -128,9 +128,10 @@ class Context:
 
     @cached_property
     def approach(self) -> FloatArray:
-        """Sign of each joint's last move, (n, k): +1 or -1; 0 before its first.
+        """Sign of each joint's last move, (n, k): +1 or -1; 0 before its first move.
 
-        Moves of less than `STILL_RAD` do not count: the sign of the row before, in time, remains.
+        Moves of less than `STILL_RAD` (or its length for a slide) do not count: the sign of the
+        previous row in time remains.
         """
         still = STILL_RAD * self.chain.per_radian
         sign = np.where(np.abs(self.last_move) > still, np.sign(self.last_move), 0.0)

@@ -42,8 +42,8 @@ class Driver:
     ) -> Curve:
         """Return a spline over the driver's values in the rows to fit, of zero mean over them.
 
-        ``share``, ``finest``: spacing of the knots, as in `Curve.of`; ``rows``: mask of rows,
-        (n,): only rows to fit among these count.
+        ``share``: distance of the knots as a share of the range of values; ``finest``: least
+        distance, in the driver's unit; ``rows``: mask, (n,): only rows to fit among these count.
         """
         chosen = context.to_fit if rows is None else context.to_fit & rows
         turns_over = self.is_angle and context.turns_over(self.joint)

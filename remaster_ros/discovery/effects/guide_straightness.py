@@ -59,9 +59,10 @@ class Guide:
         ]
 
     def penalty(self, directions: int) -> FloatArray:
-        """Return the roughness penalty of one curve for each of so many directions.
+        """Return the roughness penalty of `directions` curves, one for each direction.
 
-        (m times directions) square; the directions of a spline stand next to each other.
+        (m × directions) square, m: free splines of a curve. Parameters of the same spline in all
+        directions stand next to each other.
         """
         found: FloatArray = np.kron(self.curve.penalty, np.eye(directions)).astype(float)
         return found

@@ -60,7 +60,10 @@ def _followed(context: Context, joint: int, other: int, form: str) -> Design:
 
 
 def _coupled(context: Context, candidate: Candidate, draws: FloatArray) -> str:
-    """Phrase for the largest error: 'joint 3 turns with joint 2 by up to 1.1′ ± 0.3′'."""
+    """Phrase for the largest error: 'joint 3 turns with joint 2 by up to 1.1′ ± 0.3′'.
+
+    ``draws``: of the candidate's parameters, (draws, 1 or 2).
+    """
     verb = 'slides' if context.slides(candidate.joints[0]) else 'turns'
     return up_to(f'joint {{joint}} {verb} with joint {{other}}')(context, candidate, draws)
 

@@ -78,9 +78,11 @@ def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool
 
 
 def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Iterator[Candidate]:
-    """Yield two candidates: one that begins or changes in a gap, and one that ends in it.
+    """Yield two changes of a candidate in mid-session, as candidates.
 
-    ``changes``: makes their columns; ``gap``: start and end, s since the first row.
+    One that begins at a moment in a gap, in addition to the candidate if the model has that; and
+    one that is present only up to the moment. ``changes``: function that makes their columns;
+    ``gap``: start and end, s since the first row.
     """
     begins = replace(
         candidate,

@@ -56,9 +56,10 @@ def _columns(context: Context, sensor: int, passed_s: FloatArray, turning: bool)
 
 
 def _began(context: Context, candidate: Candidate, gap: FloatArray, ends: bool) -> Design:
-    """Return columns of a drift that begins, or becomes faster, or ends (``ends``) in a gap.
+    """Return columns of a sensor's drift, in proportion to the time since the middle of a gap.
 
-    The moment is the middle of ``gap``, s since the first row, (2,).
+    0 before that moment, so that a drift begins or becomes faster there; with ``ends`` 0 after
+    it, so that the drift ends. ``gap``: start and end, s since the first row, (2,).
     """
     since_s = context.elapsed_s - gap.mean()
     since_s = np.minimum(since_s, 0.0) if ends else np.maximum(since_s, 0.0)

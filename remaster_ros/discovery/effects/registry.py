@@ -56,13 +56,16 @@ def _effect(module: str) -> Effect:
 
 
 class _Effects(dict[str, Effect]):
-    """Effects by name: those tried on every session; others are found by name, but not listed."""
+    """Effects by name. Iteration has those tried on every session; lookup also has all others."""
 
     def __missing__(self, name: str) -> Effect:
         return MOTION[name] if name in MOTION else SLIDES[name]
 
     def get(self, name: str, default: Any = None) -> Any:
-        """Return the effect of a name, also of those not listed; else ``default``."""
+        """Return the effect of a name; ``default`` if there is none.
+
+        Also of effects that are tried only on sessions in motion or with slides.
+        """
         return super().get(name, MOTION.get(name, SLIDES.get(name, default)))
 
 

@@ -70,8 +70,8 @@ def span_of(context: Context, joint: int, span: float) -> str:
 def along_mean(draws: FloatArray) -> FloatArray:
     """Return the components of draws, (draws, c), along the direction of their mean, (draws,).
 
-    Absolute values would be too large on the average, and too close to each other, where the
-    draws lie about zero.
+    Their mean and spread are those of a size. Lengths of the draws would be biased: too large on
+    the average and too close to each other if the draws lie about zero.
     """
     mean = draws.mean(axis=0)
     along: FloatArray = draws @ (mean / max(float(np.linalg.norm(mean)), np.finfo(float).tiny))
@@ -86,8 +86,8 @@ def largest(values: FloatArray) -> float:
 def at_most(context: Context, candidate: Candidate, draws: FloatArray) -> str:
     """Return the largest error by a candidate as text: of a joint, less its mean, or of a marker.
 
-    Taken in the row where it is largest by the mean of the draws: the mean over draws of each
-    one's largest would be larger. ``draws``: of its parameters, (draws, m).
+    ``draws``: of its parameters, (draws, m). The error is taken in the row where it is largest at
+    the mean of the draws, with its spread over the draws.
     """
     columns = candidate.columns(context)
     if columns.at is not None:

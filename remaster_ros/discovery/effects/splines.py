@@ -81,7 +81,7 @@ class Curve:
         return cls(knots, start, closed, found.visited, weights)
 
     def among(self, values: FloatArray) -> Curve:
-        """Return a copy of the curve that counts these values, (n,), as the visited ones."""
+        """Return a copy of the curve whose visited values, as used by `seen`, are these, (n,)."""
         return replace(self, visited=np.unique(self.in_turn(values)))
 
     @property
@@ -165,10 +165,10 @@ class Curve:
 
 
 def start_of_turn(values: FloatArray) -> float:
-    """Return the start of the turn into which angles are brought, rad.
+    """Return the start of the turn of 2π into which angles are brought, rad.
 
-    It is the middle of the widest gap between them, less as many turns as leaves most angles
-    unchanged. ``values``: rad, (n,).
+    It lies in the middle of the widest gap between the angles modulo 2π. Of all such starts, 2π
+    apart, it is the one with which most angles stay unchanged. ``values``: rad, (n,).
     """
     at = np.sort(np.mod(values, TURN))
     gaps = np.append(at[1:], at[0] + TURN) - at

@@ -69,7 +69,7 @@ def lagging(lag_s: float) -> Driver:
 def _grown(context: Context, driver: Driver, joints: tuple[int, ...]) -> Design:
     """Return the column of links that grow in proportion to a driver.
 
-    ``joints``: numbers of the links; () for all, with the base.
+    ``joints``: numbers of the links, 0 for the base; () for all links and the base.
     """
     links = joints or range(context.joints + 1)
     return displaced(driver.value(context)[:, None] * sum(link_vector(context, j) for j in links))

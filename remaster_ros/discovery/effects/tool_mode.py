@@ -16,8 +16,9 @@ from remaster_ros.types import FloatArray
 def candidates(context: Context) -> Iterator[Candidate]:
     """Yield one candidate: δp = -R diag(m) R' a - R diag(n) R' b, 3 parameters m and 3 n, s².
 
-    m = 1/(2πf)² of the tool's first mode f along each axis of the tool. a: acceleration of the
-    tool frame; b: of the middle of the markers, less a.
+    m = 1/(2πf)² of the tool's first mode of frequency f along each axis of the tool, R: rotation
+    of the tool. a: acceleration of the tool frame's origin; b: acceleration of the centre of the
+    markers relative to that origin, to which n belongs likewise.
     """
     yield EFFECT.candidate(_swung, MODES)
 

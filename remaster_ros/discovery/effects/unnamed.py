@@ -136,10 +136,11 @@ def _candidate(
     subject: str = '',
     **more: Any,
 ) -> Candidate:
-    """Return the unnamed candidate of a form at a place.
+    """Return the candidate without a name of an error at a place that follows a form.
 
-    Its parameters are named by ``stems``, each with each of the form's suffixes; ``unit``: of
-    the error, before that of the form; ``more``: further arguments of `Candidate`.
+    Parameters are named by each of ``stems`` with each of the form's suffixes. ``unit``: of the
+    error; that of the form, such as '/K', is appended; ``more``: further arguments of
+    `Candidate`.
     """
     return EFFECT.candidate(
         columns,
@@ -229,18 +230,20 @@ def _at(context: Context, joint: int, form: _Form) -> Design:
 
 
 def _shifted(context: Context, turn: Feature, form: _Form) -> Design:
-    """Return columns of a shift that follows a form: 3 for each of its m features.
+    """Return columns of a shift in proportion to each of a form's m features: 3 for each.
 
-    Along each axis of the frames ``turn``, rotation matrices of a context, (n, 3, 3).
+    One along each axis of a frame. ``turn``: function from a context to the rotation matrices of
+    that frame in each row, (n, 3, 3).
     """
     return displaced(*along_axes(form.features(context), turn(context)))
 
 
 def _rotated(context: Context, turn: Feature, about: Feature, form: _Form) -> Design:
-    """Return columns of a rotation that follows a form: 3 for each of its m features.
+    """Return columns of a rotation in proportion to each of a form's m features: 3 for each.
 
-    About each axis of the frames ``turn``, (n, 3, 3), through the points ``about``, m, (n, 3):
-    functions of a context. Displacements of the marker, m per rad.
+    One about each axis of a frame, as displacement of the marker, m per rad. ``turn``, ``about``:
+    functions from a context to the rotation matrices of that frame, (n, 3, 3), and to points on
+    the axes, m, (n, 3).
     """
     return turned(context, along_axes(form.features(context), turn(context)), about(context))
 
@@ -351,7 +354,8 @@ def _frames(context: Context) -> Iterator[Candidate]:
 def _sensor_forms(context: Context, sensor: int) -> Iterator[_Form]:
     """Yield forms by which a sensor's shift may depend on temperature: linear, and free.
 
-    ``sensor``: its index, over whose rows the free form is made. Time has named causes.
+    ``sensor``: its index, over whose rows the free form (a spline) is made. Nothing if the
+    temperature does not vary. Time is left out, as named causes cover it.
     """
     for driver in slow_drivers(context):
         if driver == TIME:

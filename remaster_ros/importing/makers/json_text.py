@@ -54,7 +54,7 @@ class _Decoder(json.JSONDecoder):
         self.scan_once = json.scanner.py_make_scanner(self)  # type: ignore[attr-defined]
 
     def whole(self) -> Any:
-        """Decoded value of the text; of several values, the first an object, a list of all.
+        """Decoded value of the text; a list of all if it has several, the first an object.
 
         None if there are several values and the first is no object (a list in each line), or
         if text that begins with [[ is not JSON (a printed matrix). Raises InputError, with the
@@ -86,7 +86,8 @@ class _Decoder(json.JSONDecoder):
     def _array(self, at: tuple[str, int], scan_once: Any, **options: Any) -> Any:
         """Decode an array as `Items`, which has its line; return it and the index behind it.
 
-        `at`: text, and index behind the opening bracket. The others are as json passes them.
+        `at`: text, and index behind the opening bracket. The module json calls this, and its
+        `scan_once` and `options` are passed on to its own function.
         """
         values, end = json.decoder.JSONArray(at, scan_once, **options)  # type: ignore[attr-defined]
         found = records.Items(values)
@@ -96,8 +97,9 @@ class _Decoder(json.JSONDecoder):
     def _object(self, at: tuple[str, int], *args: Any, **options: Any) -> Any:
         """Decode an object as `Mapping`, which has its line; return it and the index behind it.
 
-        `at`: text, and index behind the opening brace. The others are as json passes them.
-        Raises InputError if a key is there twice.
+        `at`: text, and index behind the opening brace. The module json calls this; of its
+        further arguments `args` the hooks are not used. Raises InputError if a key is there
+        twice.
         """
         strict, scan_once, memo = args[0], args[1], args[4] if len(args) > 4 else None
         pairs, end = json.decoder.JSONObject(  # type: ignore[attr-defined]

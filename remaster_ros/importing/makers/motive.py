@@ -50,9 +50,9 @@ def _likeliness(kind: str) -> int:
 def read(text: str) -> NamedColumns | None:
     """Columns of a take exported by OptiTrack Motive; None for other text.
 
-    Frame, time, and position (and quaternion) of each asset. If all markers are without a
-    label, their pieces are put together to moving markers, with notes. Raises InputError for a
-    damaged take, or if that fails.
+    Frame, time, and position (and quaternion) of each asset. If no marker has a label, the
+    pieces of the tracks that Motive lost are joined to tracks of the markers that move, with
+    notes. Raises InputError for a damaged take, or if pieces cannot be joined.
     """
     start = _START.match(text) or _HEADLESS.match(text)
     if start is None and _HEADLESS.match(text.partition('\n')[2]):
@@ -239,10 +239,12 @@ def _moving_tracks(
 ) -> tuple[list[_Track], int]:
     """Tracks of the moving markers, joined from pieces, and the number of pieces left out.
 
-    Motive gives a marker that it lost a new number. A piece belongs to the marker that was
-    last seen, or is seen, within 10 mm of it. Of several markers only those seen in over half
-    of the frames are kept, which may be none. `groups`: label -> columns of a piece in
-    `table`; `commas`: decimal commas; `unit`: of length, '' for m.
+    Motive gives a marker that it lost a new number: that begins a new piece. A piece is joined
+    to the nearest marker within 10 mm (`_Track.distance`), else it begins a new one. Markers
+    that stay in their place are left out. The others are taken as one if never two are seen at
+    once; else only those seen in over half of the frames with any of them are kept, which may
+    be none. `groups`: label -> columns of a piece in `table`; `commas`: whether numbers have
+    decimal commas; `unit`: of length, '' for m.
     """
 
     def column(i: int) -> FloatArray:

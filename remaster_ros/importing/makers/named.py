@@ -68,9 +68,9 @@ def first_names(names: Sequence[str]) -> str:
 def leading_column(labels: list[str]) -> tuple[list[str], list[str]]:
     """Name and cells of a first column made of the text before the numbers of each line.
 
-    `labels`: these texts. The name is ['time'] if each has a time, which are the cells then;
-    else the cells are the texts, and the name is ['name'] if over half of them are different,
-    else [] (no column).
+    `labels`: these texts. ['time'] and the times if there is one in each text. Else the cells
+    are `labels`, and the name is ['name'] if over half of them are different, or [] (no
+    column).
     """
     stamps = [_TIME.search(words) for words in labels]
     if all(stamps):
@@ -92,8 +92,9 @@ def axes_in_order(
     Each position in `found` is its line, name ('' for none) and axes, such as ``A1`` -> number
     as text. `letters`: first that of the arm's axes, then those of external axes, which are
     left out if they stay at 0; `unit`: of the arm's axes; `kind`: of the file, in words.
-    Raises InputError if a position lacks an axis of the arm, or axes are not numbered from 1,
-    fewer than 2 or more than 100.
+    `maker`, `coupling` (None for none) and `notes` are put into the result as they are. Raises
+    InputError if a position lacks an axis of the arm, or axes are not numbered from 1, fewer
+    than 2 or more than 100.
     """
     every = {axis for _, _, values in found for axis in values}
     if len(every) > _MOST_AXES:

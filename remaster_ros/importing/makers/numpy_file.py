@@ -72,10 +72,12 @@ def _loaded(data: bytes, where: str) -> NDArray[Any]:
 
 
 def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], list[list[str]]]:
-    """Names and columns of an array as text; a matrix becomes its numbers row by row.
+    """Names of an array's columns, and their cells as text, column by column.
 
-    Rows are the first dimension, of three at most; a structured array has the names of its fields.
-    Raises InputError, beginning with `where`, for other shapes or types.
+    The first dimension, of three at most, has the rows; the others are flattened: a matrix for
+    each row becomes one column for each of its numbers. A structured array has the names of
+    its fields, others begin with `name`. Raises InputError, beginning with `where`, for other
+    shapes or types.
     """
     if array.dtype.names:
         fields = [_columns(array[field], field, where) for field in array.dtype.names]
@@ -95,7 +97,10 @@ def _columns(array: NDArray[Any], name: str, where: str) -> tuple[list[str], lis
 
 
 def _labels(name: str, width: int) -> list[str]:
-    """Names of an array's columns: `name` for one, then x, y, z for three, else numbers."""
+    """Names of an array's columns: `name` alone if `width` is 1, else numbered or x, y, z.
+
+    ``name x``, ``name y`` and ``name z`` for three, else ``name 1`` and so on.
+    """
     if width == 1:
         return [name]
     return [f'{name} {suffix}' for suffix in ('xyz' if width == 3 else range(1, width + 1))]

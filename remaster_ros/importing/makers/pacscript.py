@@ -63,9 +63,10 @@ def read(text: str) -> NamedColumns | None:
 
 
 def _is_cut(code: str, line: str) -> bool:
-    """Whether a comment begins within an assignment to a joint position, which is then cut off.
+    """Whether a comment cuts off an assignment to a joint position, such as ``J[1] = J(1, ' 2)``.
 
-    `code`: the line up to the comment, which has unbalanced brackets then, or no value yet.
+    `code`: the part of `line` before the comment. True if its brackets do not match, or it
+    ends before the value; False without a comment.
     """
     return code != line and (
         any(code.count(a) != code.count(b) for a, b in ('[]', '()'))

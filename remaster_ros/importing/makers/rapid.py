@@ -102,8 +102,8 @@ def read(text: str) -> NamedColumns | None:
 def _statements(text: str) -> list[tuple[int, str]]:
     """Statements of a RAPID module without comments, each with the line, from 1, where it begins.
 
-    Lines that end without a semicolon, such as ``PROC main()``, are left out, but for targets
-    in a log or of Rokae.
+    Lines such as ``PROC main()`` are left out. A statement ends with a semicolon; only joint
+    targets in a log or in Rokae's dialect may end with the line instead.
     """
     statements: list[tuple[int, str]] = []
     parts: list[str] = []

@@ -139,7 +139,11 @@ def _records(
 
 
 def _weight(columns: dict[str, Items], size: int) -> int:
-    """Number of cells in one record of those columns that have `size` values."""
+    """Number of cells in a record of one item from each list in `columns` with `size` items.
+
+    An item that is a list or mapping counts with its length (that of the first one), another
+    as 1.
+    """
     return sum(
         len(value[0]) if isinstance(value[0], (Items, Mapping)) else 1
         for value in columns.values()
@@ -163,10 +167,11 @@ def _named(header: Sequence[str], row: Items) -> Mapping:
 
 
 def _records_by_key(data: Mapping) -> list[tuple[int, Any]]:
-    """Records of a mapping of mappings, each with its line: a data frame, or named records.
+    """Records, each with its line, of a mapping whose values are mappings with equal keys.
 
-    A data frame may be by column and row, or by row and column; a key of a record becomes its
-    ``name``. [] if the mappings in `data` do not have equal keys, or are points (x, y, z).
+    These are a data frame by column (column -> row number -> cell), or one by row, or records
+    by name: of the latter two the outer key becomes the record's ``name``. [] if the keys
+    differ, or are those of points (x, y, z).
     """
     inner = [tuple(mapping) for mapping in data.values()]
     if len({*inner}) != 1 or any(
@@ -199,11 +204,12 @@ def _with_name(key: str, record: Mapping) -> Mapping:
 def _cells(
     name: str, value: Any, names: Sequence[str], depth: int, line: int
 ) -> Iterator[tuple[str, str]]:
-    """Yield column and text of each scalar of a record.
+    """Yield column name and text of each scalar in `value`, a record or a part of one.
 
-    Columns are the keys on the way, separated by blanks; lists are numbered from 1, named by
-    `names` if equally many, or x, y, z for three numbers; 4×4 matrices become point and
-    quaternion. Raises InputError, with `line`, for over 20 levels.
+    The name is that of the record's part (`name`, '' for the record) and the keys below it,
+    separated by blanks. Numbers of a list are named by `names` (of joints) if equally many, by
+    x, y, z if they are three, else from 1; 4×4 matrices become point and quaternion. `depth`:
+    levels above `value`; raises InputError, with `line`, if they are over 20.
     """
     if depth > _DEEPEST:
         raise InputError(f'line {line}: more than {_DEEPEST} levels of brackets')

@@ -23,9 +23,10 @@ _HEAD_LINES = 5
 def read(text: str) -> NamedColumns | None:
     """Columns of a capture exported by Vicon; None for other text.
 
-    Time from frame and rate, positions, and quaternions, of the likeliest section; other
-    orientations and sections are left out, with notes. Raises InputError, with the line, for
-    missing sections, axes or units, rows of other lengths, or frames that do not increase.
+    Of one section, the first of `_SECTIONS` that is there: time (frame by rate), positions,
+    and quaternions. Orientations in angles and other sections are left out, with notes. Raises
+    InputError, with the line, for missing sections, axes or units, rows of other lengths, or
+    frames that do not increase.
     """
     if not re.search(r'^"?Frame"?[,;\t]"?Sub Frame"?[,;\t]', text, re.MULTILINE):
         return None

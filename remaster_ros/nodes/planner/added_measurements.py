@@ -38,12 +38,12 @@ class AddedMeasurements:
         self._journal, self._tours = journal, tours
 
     def next_plan(self, state: str, *, under_way: bool) -> tuple[str | None, partial[Tour] | None]:
-        """Return why no new measurements are added, and the function that plans them, or None.
+        """Return why no measurements are added now, and a function that plans those to be added.
 
-        The reason is '' if measurements are added, or were and are under way (no function
-        then); None if the collection is not complete. ``state``: of the planner's run;
-        ``under_way``: whether additions are being measured already. The function takes the
-        registrations, sensor -> (4, 4), and returns the tour.
+        If measurements are added, '' and the function, which takes the registrations, sensor
+        -> (4, 4), and returns the tour. If none are, the reason and None. If the collection is
+        not complete, '' and None while earlier additions are being measured (``under_way``),
+        else None and None. ``state``: of the planner's run.
         """
         if state != 'complete':
             return '' if under_way else None, None

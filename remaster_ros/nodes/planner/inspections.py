@@ -91,8 +91,8 @@ class Inspections:
         """Return why an inspection cannot begin, with the remedy; '' if it can.
 
         ``bridge``: its last state, None if none has come. Reasons: no or an invalid
-        compensation.json, no bridge; for verify also a joint that slides, or another file in the
-        bridge (by its SHA-256).
+        compensation.json, or no bridge. For the kind verify also: a joint slides, or the
+        bridge corrects by another file than this planner's, or by none (by SHA-256).
         """
         # Imported when needed, since the import is slow.
         from remaster_ros.compensation.file import read_compensation
@@ -127,8 +127,9 @@ class Inspections:
     def tour(self, kind: Inspection) -> tuple[Callable[[], Tour], str]:
         """Return a function that plans the visits, and a message to show before the arm moves.
 
-        Raises InputError if the table of a check is invalid, or a configuration of it is in
-        collision.
+        ``kind``: verify (new poses, with the correction off and on) or check (the
+        configurations of the table `check_poses`). Raises InputError if that table is invalid,
+        or a configuration in it is in collision or too near to a joint limit.
         """
         if kind == 'check':
             # Imported when needed, since the import is slow.
@@ -169,9 +170,10 @@ class Inspections:
             self._background.submit(lambda: _output_of_verb(command), self._on_answer)
 
     def _on_answer(self, answer: str | Exception) -> None:
-        """Publish and log the verdict, with its warnings; without one log and keep the reason.
+        """Log the evaluation's verdict with its warnings, and publish its JSON output.
 
-        ``answer``: JSON output of the evaluation, or its exception, the reason for `trouble`.
+        ``answer``: that output, or the exception of the evaluation: then there is no verdict,
+        and the error is logged and kept as `trouble`.
         """
         if isinstance(answer, Exception):
             self.trouble = f'not judged: {answer}'

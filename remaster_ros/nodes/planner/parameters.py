@@ -154,7 +154,8 @@ class Parameters(InspectionParameters):
     def plan_settings(self, cell: Workcell, causes: Sequence[FoundCause]) -> dict[str, Any]:
         """Return everything that the plan depends on, as plain data by name.
 
-        Another plan has other settings; speeds are left out if the plan does not depend on them.
+        The plan in a session's journal is of other parameters or another cell if its settings
+        differ from these. Speeds are left out if the plan does not depend on them.
         """
         design = cell.design_settings()
         speeds = {

@@ -70,12 +70,14 @@ class PlanPreview(PlanConfirmation):
         return refusal
 
     def draw(self, q: FloatArray, peers: Peers) -> str:
-        """Draw the next plan if the page shows another one; return a message for the user.
+        """Draw the page of the next plan if it shows another one; return a message for the user.
 
-        '' while it is drawn, if nothing has changed, if no confirmation is required, and if it
-        cannot be told which plan is next, when `trouble` says why. If planning or drawing it
-        fails, the message says so, once. ``q``: the arm's configuration, rad or m, (k,);
-        ``peers``: tell which sensors must be registered before the collection.
+        The page is drawn in the background, so that this is called again and again. The
+        message, once the page is drawn, is `refusal`: what to confirm, or why planning or
+        drawing failed. '' while the page is drawn, if nothing has changed, if no confirmation
+        is required, and if the next plan is not known yet; `trouble` has the reason then.
+        ``q``: the arm's configuration, rad or m, (k,); ``peers``: the other nodes; they tell
+        which sensors must be registered first.
         """
         if not self.required:
             return ''

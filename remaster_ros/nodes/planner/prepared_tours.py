@@ -13,14 +13,17 @@ from remaster_ros.types import FloatArray
 
 
 class PreparedTours(TourPlanner):
-    """A `TourPlanner` whose curves one thread prepares while another one waits for them."""
+    """A `TourPlanner` whose curves for measuring in motion are chosen ahead in another thread."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **options)
         self._preparing = threading.Lock()
 
     def prepare(self) -> None:
-        """Choose the curves ahead, as `TourPlanner.prepare`; `moving` waits meanwhile."""
+        """Choose the curves for measuring in motion ahead, as `TourPlanner.prepare`.
+
+        To be called in a thread of its own; a call of `moving` waits for its end.
+        """
         with self._preparing:
             super().prepare()
 

@@ -101,7 +101,9 @@ class LaserTrackerDriver(TriggeredDriver):
     def turn_to(self, marker: str, expected: FloatArray) -> None:
         """Search at the expected position, unless the beam is on the marker.
 
-        See `TriggeredDriver`.
+        ``marker``: name, '' for the marker that the sensor follows; ``expected``: position in
+        the tracker's frame, m, (3,). Up to `attempts` searches, one for a marker that was
+        missed last time. Raises LaserTrackerError if no reflector is found.
         """
         if marker == self._on:
             return

@@ -310,9 +310,10 @@ class TrackerLink:
     def _count_unexpected(
         self, event: Reply | ErrorReport | Measurement, exchange: _Exchange
     ) -> None:
-        """Count and drop a packet that does not belong to the exchange.
+        """Count and drop a packet that is not the awaited answer of an exchange.
 
-        Raises LaserTrackerError if it is the exchange's error report, or the exchange is late.
+        Raises LaserTrackerError if it reports an error of the exchange's command or of an
+        unknown one, or if the exchange's time-out is over (the connection is closed then).
         """
         if isinstance(event, ErrorReport) and event.command in (exchange.command, Command.UNKNOWN):
             self._check(event.status or Status.NO_STATIONARY_RESULT, exchange.what)
@@ -330,9 +331,10 @@ class TrackerLink:
         )
 
     def _deadline(self, timeout_s: float) -> Callable[[], bool]:
-        """Function that is true once a time-out is over, by the injected clock and in wall time.
+        """Function that returns whether a time-out is over, by the link's clock and in wall time.
 
-        ``timeout_s``: s from now; of wall time at most `_LEAST_WALL_S` of it are required.
+        ``timeout_s``: s from now by the link's (injected) clock. In wall time as much must
+        have passed too, but no more than `_LEAST_WALL_S`.
         """
         end, wall_end = self._now() + timeout_s, time.monotonic() + min(timeout_s, _LEAST_WALL_S)
         return lambda: self._now() >= end and time.monotonic() >= wall_end

@@ -146,7 +146,11 @@ class NatNetClient(MarkerFollower):
             self._send(natnet.join_datagram(MessageId.REQUEST_MODELDEF))
 
     def _is_unicast(self, server: ServerInfo) -> bool:
-        """Whether the server streams unicast, by its own answer if it has one."""
+        """Whether the server streams unicast, by its own answer.
+
+        By the setting `transport` if the answer has no connection settings (before NatNet
+        3.0).
+        """
         if server.connection is None:
             return self._settings.transport == 'unicast'
         return not server.connection.is_multicast
@@ -311,8 +315,9 @@ class NatNetClient(MarkerFollower):
     def _take_bitstream(self, answer: natnet.Response | None) -> None:
         """Process the answer to the request of `_negotiate`; None if the server refused it.
 
-        The version becomes the answered one, the wanted one for the code 0, else the server's
-        own. Ignored if no answer is awaited.
+        The version that is read from then on is the one in the answer's text
+        (``Bitstream,4.1``), the wanted one if the answer is the code 0, else the server's own.
+        Ignored if no answer is awaited.
         """
         if self._status.server is None or self._status.version is not None:
             return

@@ -176,7 +176,10 @@ class MarkerGate:
         self.counts.dropped[reason] += 1
 
     def pass_over(self, reason: Dropped) -> None:
-        """Count a whole frame that is not examined, and compared with no other, by its reason."""
+        """Count a whole frame, and the reason why it is not searched for the marker.
+
+        It is not remembered: later frames are not compared with it.
+        """
         self.counts.frames += 1
         self.counts.dropped[reason] += 1
         self.counts.last_reason = reason
@@ -250,7 +253,8 @@ class MarkerGate:
     def _find(self, frame: Frame) -> LabeledMarker | Dropped:
         """The marker in a frame, or the reason why not; never occluded or model-filled.
 
-        Of a lone marker the only one measured, labelled or not. Sets `counts.labels`.
+        A lone marker is the only marker that is neither, labelled or not; another marker is
+        found by its id, and must be labelled. Sets `counts.labels`.
         """
         self.counts.labels = tuple(marker.id for marker in frame.labeled_markers[:8])
         if self._choice.lone_marker:
@@ -311,10 +315,12 @@ def _implausible(reading: MarkerSample) -> Dropped | None:
 def _sample(
     frame: Frame, marker: LabeledMarker, received_s: float, ticks_per_s: int
 ) -> MarkerSample:
-    """Sample of a marker in a frame, its age since exposure or arrival at the server, s.
+    """Sample of a marker in a frame, with its age at transmission, s.
 
-    The age is the server's estimate if it has no clock, and 0 if it sent no times. ``received_s``:
-    when this computer got it, s; ``ticks_per_s``: of the server's clock, 0 for none.
+    The age is the time since exposure or, without its time, since the data arrived at the
+    server; 0 if the frame has neither time. Without a clock of the server it is the server's
+    own estimate of its latency. ``received_s``: when this computer got the frame, s;
+    ``ticks_per_s``: of the server's clock, 0 for none.
     """
     age_s = max(frame.software_latency, 0.0)
     if ticks_per_s:

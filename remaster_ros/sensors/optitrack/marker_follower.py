@@ -254,7 +254,7 @@ def _no_marker(status: StreamStatus) -> Diagnosis:
 
 
 def _label(marker_id: int) -> str:
-    """Id as asset:member."""
+    """Marker id as text ``asset:member``, the numbers in its upper and its lower 16 bits."""
     return f'{marker_id >> 16}:{marker_id & 0xFFFF}'
 
 
@@ -395,7 +395,7 @@ class MarkerFollower(ABC):
         return True
 
     def _note_closed_port(self) -> None:
-        """Set `port_closed` of the status: whether the server's computer has no command port."""
+        """Set `port_closed` of the status: whether the server's command port has no listener."""
         self._status.port_closed = port_is_closed(
             self._status.server_ip, self._settings.command_port, encode_echo_request(0)
         )

@@ -52,7 +52,10 @@ def _same(item: Any) -> Any:
 
 
 def stepped_over(*_: Any) -> None:
-    """Return None, as the record of items that are written and skipped, but never kept."""
+    """Return None for any arguments: the `build` of a `Record` whose items are not kept.
+
+    Such items are only skipped and written.
+    """
 
 
 class Row(Codec):

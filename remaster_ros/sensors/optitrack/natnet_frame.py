@@ -192,8 +192,10 @@ def _require_finite(values: Iterable[float], what: str) -> None:
 def _labeled(rows: list[tuple], *, has_residual: bool) -> list[LabeledMarker]:
     """Labelled markers of rows of numbers, in order.
 
-    Raises ProtocolError if the position of a marker that is not occluded is not finite; the sum of
-    all numbers shows whether any is not.
+    ``has_residual``: whether a row ends with the marker's residual; else the residual is None.
+
+    Raises ProtocolError if the position of a marker that is not occluded is not finite.
+    Positions are looked at singly only if the sum of all numbers is not finite.
     """
     # The named tuple's own constructor would take as long as decoding the rest of the frame.
     make = tuple.__new__
@@ -225,7 +227,10 @@ def _flat_labeled_3(marker: LabeledMarker) -> tuple:
 
 
 def _flat_body_3(body: RigidBody) -> tuple:
-    """Numbers of a rigid body from NatNet 3 on: id, position, x, y, z, w, error, flags."""
+    """Numbers of a rigid body from NatNet 3 on.
+
+    Id, position, orientation as a quaternion (x, y, z, w), mean error, flags.
+    """
     return body.id, *body.position, *body.orientation_xyzw, body.mean_error, body.params
 
 

@@ -115,7 +115,8 @@ def encode_model_definition(definition: ModelDefinition, version: Version) -> by
 def _read(reader: Reader, version: Version) -> Description:
     """Read the description at the reader's position.
 
-    From 4.1 on one of an unknown kind has its number alone; before, that raises ProtocolError.
+    Of an unknown kind: from 4.1 on an `OtherDescription` with the number of the kind and no
+    name; before, ProtocolError is raised, as its size is unknown.
     """
     kind = I32.read(reader)
     codec = _codecs(min(version, NEWEST_VERSION)).get(kind)

@@ -177,10 +177,11 @@ class NatNetClientBackend(MarkerFollower):
                 self._compare(sample, theirs)
 
     def _compare(self, sample: MarkerSample, markers: tuple[LabeledMarker, ...] | None) -> None:
-        """Hand a reading on if natnetclient has read the same marker position, without flags.
+        """Hand a reading on if natnetclient has read the same marker position, with no flag set.
 
-        Else it is withdrawn (`Dropped.DISAGREEMENT`). ``markers``: those that natnetclient has
-        read from the datagram, None if it failed.
+        A flag: occluded, model-filled or the like. Otherwise the reading is withdrawn
+        (`Dropped.DISAGREEMENT`). ``markers``: those that natnetclient has read from the
+        datagram, None if it failed.
         """
         if markers is not None and any(
             marker.position == tuple(sample.position) and not marker.params

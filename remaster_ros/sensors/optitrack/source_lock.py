@@ -68,14 +68,19 @@ class SourceLock:
         self._others: dict[Source, _OtherSource] = {}
 
     def answer(self) -> None:
-        """Record an answer of the command channel: later frames may get the lock."""
+        """Record that the server has answered on its command channel.
+
+        From then on a source other than the last holder may get the lock, by the rules of
+        `judge`.
+        """
         self._answered = True
 
     def release_if_silent(self, now_s: float) -> bool:
-        """Release the lock after a silence of its source; True if it was released now.
+        """Release the lock if its source is silent; return whether it was released now.
 
-        A silence is more than `silence_s` without a whole frame; then an answer is needed for a
-        new lock.
+        Silent: its last whole frame is more than `silence_s` ago. After a release the same
+        source gets the lock back with its next frame; another one can get it only after the
+        server has answered anew (`answer`). False if no source has the lock. ``now_s``: s.
         """
         if self.source is None or now_s - self._last_frame_s <= self._silence_s:
             return False
@@ -84,10 +89,11 @@ class SourceLock:
         return True
 
     def is_refused(self, source: Source, now_s: float) -> bool:
-        """Whether all datagrams of this source are ignored; notes that it sent.
+        """Whether all datagrams of this source are ignored now; if so, note that it has sent one.
 
-        They are while another source has the lock, and for `REFUSED_FOR_S` after the last one
-        if this source sent beside a source with the lock (for longer than `PROBATION_S`).
+        While a source has the lock, all other sources are ignored. While none has it, a source
+        is ignored that had first sent more than `PROBATION_S` before a frame of the last
+        holder, until it has been silent for more than `REFUSED_FOR_S`. ``now_s``: s.
         """
         if source == self.source:
             return False
@@ -101,10 +107,13 @@ class SourceLock:
         return True
 
     def judge(self, source: Source, now_s: float) -> SourceVerdict:
-        """Verdict on a whole frame at `now_s`, s, by its source, which may get the lock with it.
+        """Verdict on a whole frame by its source, which may get the lock with this frame.
 
-        While no source has the lock, the last holder gets it back at once; another one after
-        an answer, with `PROBATION_FRAMES` frames in `PROBATION_S` or more as the only source.
+        FOREIGN if the source `is_refused`; BELIEVED if it has the lock. While no source has
+        it, the last holder gets it back with its next frame (BELIEVED). Another source gets it
+        only after an `answer`, once it has sent `PROBATION_FRAMES` frames over at least
+        `PROBATION_S`, and no other candidate was heard in the last `silence_s`; until then the
+        verdict is PROBATION. ``now_s``: time of the frame, s.
         """
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN
@@ -129,9 +138,10 @@ class SourceLock:
         return SourceVerdict.BELIEVED
 
     def rivals(self, now_s: float) -> tuple[Source, ...]:
-        """Refused sources that sent lately, while or after another had the lock.
+        """Sources other than the believed one that sent in the last `REFUSED_FOR_S`.
 
-        Lately is in the last `REFUSED_FOR_S`; ``now_s``: s.
+        While no source has the lock, only those that are refused, as they sent while another
+        source had it (`is_refused`). ``now_s``: s.
         """
         return tuple(
             source
@@ -146,9 +156,10 @@ class SourceLock:
         return tuple(candidates) if len(candidates) > 1 else ()
 
     def _candidates(self, now_s: float) -> list[Source]:
-        """Sources that could get the lock: heard lately, and never beside a source that had it.
+        """Sources that could get the lock: heard in the last `silence_s`, and no rivals.
 
-        Lately is in the last `silence_s`; ``now_s``: s.
+        A rival had first sent more than `PROBATION_S` before a frame of a source with the
+        lock. The last holder is not in the list: it gets the lock back at once. ``now_s``: s.
         """
         return [
             source

@@ -77,7 +77,10 @@ def _sighting(message: Any, place: Any, turn: Any = None) -> Sighting:
 
 
 def _marker(message: Any, marker: str) -> Any:
-    """Translation of the marker of a name or number; None if the message does not have it."""
+    """Translation (fields x, y, z) of the marker with a name or number; None if there is none.
+
+    ``message``: with a list of markers; ``marker``: the name, or the number as text.
+    """
     for entry in message.markers:
         if marker in (entry.marker_name, str(entry.marker_index)):
             return entry.translation
@@ -249,9 +252,10 @@ class TopicDriver(StreamDriver):
     def state(self) -> SensorState:
         """State by the messages received, and by the publishers once silent for `SILENT_S`.
 
-        Not ready if a message was refused with a fault, the positions repeat (`FROZEN`), or the
-        topic is silent and has no publisher or always sends. A hidden marker, or a low rate, is a
-        trouble that leaves it ready.
+        Not ready if the last message was refused with a fault, or if the positions repeat
+        (`FROZEN`). A silent topic is not ready if no node publishes it with its type, or if
+        the parameter `always_sends` is set. A hidden marker, or a low rate, is a trouble that
+        leaves it ready.
         """
         with self._lock:
             last_wall, counts = self._came_wall, dict(self._counts)

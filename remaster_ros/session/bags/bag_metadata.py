@@ -39,9 +39,10 @@ class FileMetadata:
     count: int = 0
 
     def add(self, stamp_ns: int) -> None:
-        """Count a message with a stamp, ns since the epoch, as the last one so far.
+        """Count a message, and set the last stamp to ``stamp_ns``, ns since the epoch.
 
-        The first call sets the start, too; stamps are not compared.
+        The first call sets the first stamp, too. An earlier stamp than the last one is taken
+        as it is.
         """
         if self.first_ns is None:
             self.first_ns = stamp_ns

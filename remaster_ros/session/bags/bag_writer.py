@@ -118,10 +118,11 @@ class BagWriter:
     def write(self, topic: str, msgtype: str, cdr: bytes, stamp_ns: int) -> None:
         """Write one message.
 
-        Stamps that run backwards (a clock was set) are stored as the latest stamp so far, because
-        readers refuse an unindexed file out of order; the given stamp is stored as MCAP's
-        ``publish_time``. If the clock has restarted since the previous file, the whole file is
-        shifted to a second after it.
+        A stamp before the latest one so far (the clock was set back) is stored as the latest
+        one, because readers refuse an unindexed file out of order; the given stamp is stored
+        as MCAP's ``publish_time``. If the first stamp of a file is before the last one of the
+        previous file, all stamps of the new file are shifted, so that it begins a second after
+        that one.
 
         Parameters
         ----------
@@ -294,7 +295,8 @@ def _remove_work(folder: Path) -> None:
 def _remove_beginnings(folder: Path) -> None:
     """Remove the files of a writer that was killed before its first file was complete.
 
-    Temporary files, and metadata.yaml if it is alone; other folders are unchanged.
+    Temporary files (.*.tmp), and then metadata.yaml if nothing else is in the folder. Nothing
+    happens if there is no such folder.
     """
     if folder.is_dir():
         remove_leftovers(folder)

@@ -35,10 +35,11 @@ def without_zeros(file: IO[bytes], size: int) -> int:
 def frames(file: IO[bytes], size: int, crc: int | None, solid: int) -> Iterator[tuple[int, bytes]]:
     """Yield opcode and content of every record up to the end of the data section.
 
-    ``size``: bytes of the file; ``crc``: CRC-32 of the bytes before, None within a chunk, which
-    ends without a data section's end; ``solid``: bytes without trailing zeros. Raises CutOffError
-    for a record that extends beyond the end or ends among trailing zeros; ValueError if the
-    checksum of the data section does not match.
+    ``file``: MCAP file, read from its present place, or an unpacked chunk; ``size``: its
+    bytes; ``solid``: its bytes without trailing zeros; ``crc``: CRC-32 of the file's bytes
+    before that place, None for a chunk, which has no record DataEnd and is read to its end.
+    Raises CutOffError for a record that extends beyond the end or ends among trailing zeros;
+    ValueError if the checksum of the data section does not match.
     """
     while True:
         head = file.read(9)

@@ -192,9 +192,9 @@ def _held_lines(p: CellProposal) -> list[str]:
 
 
 def _sensor_lines(name: str, p: CellProposal) -> list[str]:
-    """Return the YAML lines of a sensor, with its proposed place and viewing angle.
+    """Return the YAML lines of a sensor, with its proposed rough position and viewing angle.
 
-    ``name``: a key of `SENSORS`.
+    ``name``: of the sensor, a key of `SENSORS`; ``p``: has the proposals.
     """
     sensor, place, angle = SENSORS[name], p.sensor_R, p.max_angle_deg[name]
     why = 'a retroreflector' if sensor.single_shot else 'a sphere is seen from far round'

@@ -172,7 +172,9 @@ class CellSensor(msgspec.Struct, forbid_unknown_fields=True):
     def _marker_problem(self, where: str, markers: Mapping[str, Triple]) -> str:
         """First validation error of the sensor's markers, prefixed by its YAML path; '' if valid.
 
-        Names, numbers in the body, and distances below `LEAST_APART_M`.
+        Errors are unknown, repeated or malformed names, numbers within the tracked body that
+        are repeated or not from 1 to 65535, and markers closer to each other than
+        `LEAST_APART_M`. ``where``: YAML path of the sensor; ``markers``: as of `problem`.
         """
         names = ', '.join(markers)
         if self.marker not in markers:
@@ -337,10 +339,10 @@ class Workcell(msgspec.Struct, forbid_unknown_fields=True):
         )
 
     def held(self, chain: SerialChain) -> dict[int, tuple[float, ...]] | None:
-        """Return index (from 0) -> values (rad or m) of the joint held in inverse kinematics.
+        """Return the joint that stays at given values in inverse kinematics: index -> values.
 
-        A dictionary of one entry; None if no joint is held. Raises ValueError if the chain has
-        no such joint.
+        A dictionary of one entry: index from 0 in ``chain``, and the values to choose from,
+        rad or m. None if no joint is held. Raises ValueError if the chain has no such joint.
         """
         if not self.held_joint:
             return None

@@ -116,9 +116,9 @@ class Expansion:
         return ''.join(joined)
 
     def _count(self, part: Any) -> None:
-        """Add a part (a text: its length, else 1) to the length of the expansion.
+        """Add the length of a part (characters of a text, else 1) to that of the expansion.
 
-        Raises InputError above `URDF_LIMIT`.
+        Raises InputError if the length is then above `URDF_LIMIT`.
         """
         self._written += len(part) if isinstance(part, str) else 1
         if self._written > URDF_LIMIT:
@@ -216,10 +216,10 @@ class Expansion:
             yield self._file(found)
 
     def _parsed(self, given: Any, filename: str = '') -> Any:
-        """Return the parsed XML of the file ``filename``; ``given`` is not used.
+        """Return the parsed XML of the file ``filename``, in place of xacro.parse.
 
-        Raises InputError if it declares entities or cannot be read, XacroException if there is no
-        such file.
+        ``given``: argument of xacro.parse that is not used. Raises InputError if the file
+        declares entities or cannot be read, XacroException if there is no such file.
         """
         path = Path(filename)
         if not path.exists():

@@ -62,10 +62,12 @@ def evaluate(expression: str, names: Mapping[str, Any]) -> Any:
 
 
 def global_names(**functions: Any) -> dict[str, Any]:
-    """Return name -> value for every expression: Python's, math's, ``functions`` in ``xacro``.
+    """Return name -> value of what every expression may use: functions, modules and constants.
 
-    load_yaml, abs_filename and dotify among them are known without the prefix, too. The caller
-    provides replacements of functions with side effects.
+    These are the permitted functions of Python and of math, with and without the prefix
+    ``python.`` or ``math.``, and ``functions`` with the prefix ``xacro.``; of the latter
+    load_yaml, abs_filename and dotify also without it. ``functions``: replacements for xacro's
+    own ones.
     """
     xacro = Namespace({name: Function(call) for name, call in functions.items()})
     return {
@@ -136,7 +138,10 @@ class _Evaluation:
         return _item(holder, self._data(node.slice))
 
     def _of_UnaryOp(self, node: ast.UnaryOp) -> Any:
-        """Negation of a truth value, or a number with its sign; ExpressionError for others."""
+        """Value of `not` before any value, or of `+` or `-` before a number.
+
+        Raises ExpressionError for `~`, or a sign before another value.
+        """
         value = self._data(node.operand)
         if isinstance(node.op, ast.Not):
             return not value
@@ -233,7 +238,7 @@ def _item(holder: Any, key: Any) -> Any:
 
 
 def _bounded(value: Any) -> Any:
-    """Return a value unchanged; raise ExpressionError if it is too large or complex.
+    """Return a value unchanged; raise ExpressionError if it is too large or a complex number.
 
     Too large: an integer above 4096 bits (`MOST_BITS`), or over 100,000 characters or items.
     """
@@ -273,9 +278,10 @@ def _length(value: Any) -> int:
 
 
 def _times(left: Any, right: Any) -> Any:
-    """Return a product, also of a text or list and a number.
+    """Product of two numbers, or a text, list or tuple repeated by a whole number, on either side.
 
-    Raises ExpressionError if a text or list would be longer than `LONGEST`, or for other values.
+    Raises ExpressionError if the repeated text or list would be longer than `LONGEST`, or if
+    the values are neither.
     """
     for text, count in ((left, right), (right, left)):
         if isinstance(text, str | list | tuple) and isinstance(count, int):
@@ -295,9 +301,10 @@ def _power(left: Any, right: Any) -> Any:
 
 
 def _plus(left: Any, right: Any) -> Any:
-    """Sum of two numbers, or two texts, lists or tuples joined.
+    """Sum of two numbers, or two texts, two lists or two tuples joined.
 
-    Raises ExpressionError for other values, TypeError for two different ones of these three.
+    Raises TypeError for a text, list or tuple with another of these types, ExpressionError for
+    any other values.
     """
     if isinstance(left, str | list | tuple) and isinstance(right, str | list | tuple):
         return operator.add(left, right)
@@ -329,9 +336,10 @@ def _replace(text: str, old: str, new: str) -> str:
 
 def _round(value: Any, ndigits: int = 0) -> Any:
     # That of a whole number works out 10 to the power of the digits.
-    """Return a number rounded to `ndigits`, limited to ±400; to a whole number for 0.
+    """Return a number rounded to `ndigits` decimals, as Python's round; a whole number for 0.
 
-    Raises ExpressionError or TypeError for another value.
+    `ndigits` beyond ±400 counts as ±400. Raises ExpressionError or TypeError if `value` is no
+    number.
     """
     return round(_number(value), max(-400, min(ndigits, 400))) if ndigits else round(value)
 

@@ -68,10 +68,10 @@ class Journal:
         return os.fstat(self._file.descriptor).st_nlink
 
     def restore(self) -> None:
-        """Write all records into a new file of this name, after the open file has lost the name.
+        """Write all records into a new file at the journal's path, and continue in that.
 
-        Raises InputError if another process writes the file on the disk, DiskError if the disk
-        is full.
+        For a journal whose file was removed or replaced by others. Raises InputError if
+        another process writes the file that is now there, DiskError if the disk is full.
         """
         write_atomically(self.path, self.content)
         self._file.close()
@@ -103,7 +103,7 @@ class Journal:
     def take_back(self) -> None:
         """Remove the last appended record from file, `records` and `content`.
 
-        Raises InputError if that is impossible.
+        Raises DiskError if the file cannot be shortened, InputError if it is closed.
         """
         previous_size = self.content.rfind(b'\n', 0, -1) + 1
         self._file.truncate(previous_size)

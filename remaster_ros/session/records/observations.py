@@ -88,9 +88,10 @@ class Table:
         return InputError(f'{self.path}, line {line}, column {column}: {shown} {problem}')
 
     def refuse(self, wrong: BoolArray, problems: Mapping[str, str]) -> None:
-        """Raise the InputError of the first True of ``wrong``, (n, columns), if there is one.
+        """Raise an InputError on the first wrong cell; nothing if there is none.
 
-        ``problems``: end of the sentence by column, in the order of the columns.
+        ``wrong``: True for wrong cells, (n, columns); ``problems``: column name -> end of the
+        sentence of the error, in the order of the columns of ``wrong``.
         """
         for row, column in np.argwhere(wrong)[:1]:
             name = list(problems)[column]
@@ -356,9 +357,9 @@ class RowFormat:
     def _convert(self, table: Table) -> Measurements:
         """Return the columns of a table, each checked by itself.
 
-        Raises InputError for text that is no number or unknown name, a quaternion off length 1 by
-        over 0.001, a negative std, joints outside the limits (if these are checked), or a far
-        point.
+        Raises InputError for text that is no number or unknown name, a quaternion off length 1
+        by over 0.001, a negative std, joints outside the limits (if these are checked), or a
+        point with a coordinate beyond `FARTHEST_M`.
         """
         columns, chain = self._columns, self._chain
 
@@ -577,9 +578,10 @@ def _check_names(names: list[str], columns: Mapping[str, list[str]], path: Path)
 def inverted_readings(m: Measurements, sensors: Sequence[int], where: str) -> Measurements:
     """Return rows in which the poses measured by sensors on the tool are inverted.
 
-    ``sensors``: indices of these. Poses of a fixed body in the sensor's frame become poses of
-    the sensor in the body's frame, and back. The same object if there are no rows of them,
-    else a copy. Raises InputError, which begins with ``where``, if one has no orientation.
+    ``sensors``: indices of these sensors. Poses of a fixed body in the sensor's frame become
+    poses of the sensor in the body's frame, and these become those again. Without rows of
+    these sensors the same object is returned, else a copy. Raises InputError, which begins
+    with ``where``, if one of their rows has no orientation.
     """
     mine = np.flatnonzero(np.isin(m.sensor, sensors))
     if len(mine) == 0:

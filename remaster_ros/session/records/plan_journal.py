@@ -81,7 +81,11 @@ class VisitRecord(msgspec.Struct, tag_field='kind', tag='stop'):
     unreached: tuple[int, ...] = ()
 
     def replay(self, tour: Tour) -> PoseVisit:
-        """Count this visit in a tour, in place; return it without paths, to be planned anew."""
+        """Count this visit as made in ``tour``, in place, and return it.
+
+        The visit has the joint solutions of the record, but no paths to them: these have to be
+        planned anew.
+        """
         return tour.record_visit(self.split, self.index, self.ids, (), self.unreached)
 
 
@@ -303,7 +307,8 @@ class PlanJournal:
     def _follow(self, record: PlanRecord) -> None:
         """Update tour, visit, state and run by a record, of this planner or of one before it.
 
-        Records on a tour are ignored before there is one.
+        Visits, requests of reference rounds, and dropped poses to fit change the tour in
+        place; before there is a tour they are ignored.
         """
         tour = self.tour
         match record:
@@ -357,15 +362,16 @@ class PlanJournal:
     def request_reference_round(self) -> None:
         """Request a round of visits to the reference configurations, as the setup was changed.
 
-        Nothing happens without a tour or references.
+        The request is recorded, and inserts the round in `tour`. Nothing happens without a
+        tour or references.
         """
         if self.tour is not None and self.tour.references:
             self._note(RoundRecord())
 
     def drop_remaining_fits(self) -> None:
-        """Drop the remaining poses to fit, as the precision goal is reached.
+        """Record that the precision goal is reached: the tour drops the remaining poses to fit.
 
-        Nothing without a tour.
+        Nothing happens without a tour.
         """
         if self.tour is not None:
             self._note(EnoughRecord())

@@ -64,9 +64,10 @@ class SessionGuard:
         return found is not None and found[:2] == (mine.st_dev, mine.st_ino)
 
     def take_place(self) -> None:
-        """Open the folder that is at the session's path now, and compare with it from now on.
+        """Open the folder that is at the session's path now, in place of the one before.
 
-        It is kept open, because the inode of a removed folder may be reused.
+        `is_in_place` compares with it from then on. It is kept open, because the inode of a
+        removed folder may be reused. Raises DiskError if it cannot be opened.
         """
         self.close()
         with writing(self._folder):

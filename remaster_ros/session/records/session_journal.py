@@ -131,8 +131,8 @@ class SessionJournal:
     def reopen(self, *, go_further: bool = False) -> None:
         """Continue a stopped session; with ``go_further``, a complete one.
 
-        The state is restored from the journal. A complete session is otherwise left closed, with a
-        note. Raises InputError as the class.
+        The state is restored from the journal. Without ``go_further`` a complete session stays
+        closed, which a line in `notes` says. Raises InputError as the class.
         """
         if is_complete(self.folder) and not go_further:
             rows = read_limited(self.folder / ROWS, OBSERVATIONS_LIMIT, 'it is part of a session')
@@ -184,10 +184,10 @@ class SessionJournal:
         return self.outcomes.plan
 
     def follow(self, plan_id: str) -> bool:
-        """Bind the session to a plan; return False if it belongs to another one.
+        """Bind the session to a plan; return False if it has observations of another plan.
 
-        A session without observations, or without a plan, takes the new one, which is written to
-        the journal.
+        Else True: the session has this plan already; or it has no observations or no plan yet,
+        and the new plan is written to the journal.
         """
         if plan_id == self.plan_id:
             return True
@@ -206,9 +206,9 @@ class SessionJournal:
 
     @property
     def correction(self) -> Correction | None:
-        """Correction by the bridge that the session's rows are measured with, as noted in it.
+        """Correction that the bridge applied to the commands of this session, as recorded in it.
 
-        None if none is noted, or if the session was complete when it was opened.
+        None if none is recorded, or if the session was complete when it was opened.
         """
         return None if self._writer is None else self._writer.correction
 
@@ -323,9 +323,10 @@ class SessionJournal:
         ]
 
     def _columns(self, reading: PairedReading) -> dict[str, Any]:
-        """Return a reading's fields for an observation, without the number of dropped frames.
+        """Return the fields of an `Observation` that a reading has, name -> value.
 
-        The stamp is shifted (`_keep_time`); of a sensor on the tool the pose is inverted.
+        The stamp is shifted (`_keep_time`); the pose by a sensor on the tool is inverted. The
+        number of frames that were dropped from the reading is no such field.
         """
         if reading.sensor in self._header.on_tool:
             reading = reading.inverted()

@@ -138,10 +138,12 @@ def _reopen(folder: Path, *, keep_status: bool) -> str:
 
 
 def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str]) -> int:
-    """Return the number of bytes of observations.csv that are whole lines equal to the journal's.
+    """Return how many bytes at the begin of observations.csv are to be kept after a crash.
 
-    ``data``: content of the file; ``wanted``: content by the journal, whose last record with rows
-    has `last_rows`: only these can be torn. Raises ChangedError if an earlier byte differs.
+    ``data``: content of the file; ``wanted``: its content by the journal. All bytes if
+    ``wanted`` begins with them; else the whole lines before the first byte that differs. That
+    byte may only be in ``last_rows``, the rows that were written last, as a crash can tear
+    these alone. Raises ChangedError if it is earlier, or the file is longer than ``wanted``.
     """
     if wanted.startswith(data):
         return len(data)
@@ -248,8 +250,8 @@ class SessionWriter:
         """Complete a correction that the journal has and the other files may lack after a crash.
 
         Its columns go into an observations.csv without rows, its key into session.yaml.
-        Nothing happens without a recorded one. ``plain_rows``: observations.csv without rows
-        and without these columns.
+        Nothing happens if the journal has no correction. ``plain_rows``: content of
+        observations.csv without rows and without these columns.
         """
         noted = [record for record in self.records if record['kind'] == 'correction']
         if not noted:
@@ -308,7 +310,10 @@ class SessionWriter:
         return self._journal.records
 
     def _content(self, name: str) -> bytes:
-        """Return the acknowledged content of a file, by one of the names in `FILES`."""
+        """Return the bytes that a file of the session must have, by all records written so far.
+
+        ``name``: one of `FILES`: session.yaml, URDF, observations.csv and journal.
+        """
         if name == ROWS:
             rows = (row for record in self.records for row in record.get('rows', ()))
             return self._empty_rows + ''.join(f'{row}\n' for row in rows).encode()
@@ -461,11 +466,13 @@ class SessionWriter:
     def close(self, exit_status: ExitStatus = 'complete') -> ExitStatus:
         """Write exit status and checksums of all files; return the exit status.
 
-        Every byte is compared with the acknowledged content first (`check`). A second call does
-        nothing. ``aborted`` is returned instead of ``complete`` if something is `beyond_repair`.
+        Every byte is compared first with what was written, and files that others changed are
+        repaired (`check`). A second call does nothing and returns the same. ``aborted`` is
+        written and returned instead of ``complete`` if `beyond_repair` has a reason (the
+        folder was removed).
 
-        After a DiskError call again when there is room. Until then the session remains readable,
-        as aborted or without checksums.
+        After a DiskError call again when there is room. Until then the session remains
+        readable, as aborted or without checksums.
         """
         if self._closed:
             return self._closed_as

@@ -384,9 +384,10 @@ def _unknown_keys(
 
 
 def _merge(content: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of content with unknown keys of ``extra`` added at their places.
+    """Return a copy of ``content`` with the keys of ``extra`` that it lacks.
 
-    Known keys keep their values; mappings are merged at every level.
+    Keys that it has keep their values; if both values are mappings, they are merged in the
+    same way, at every level.
     """
     merged = dict(content)
     for key, value in extra.items():

@@ -176,7 +176,8 @@ def _require_same_arm(first_name: str, first: Session, name: str, session: Sessi
     """Raise InputError if two sessions have different robots or controller corrections.
 
     Different robots: URDF, base or tip link, or serial number, if both sessions have one.
-    Corrections: those made inside the controller; none is different from one.
+    Corrections: those made inside the controller; a session with one and a session without one
+    differ. ``first_name``, ``name``: of the sessions, for the message.
     """
     inside = [
         str(given.correction)
@@ -221,9 +222,9 @@ def _renamed(session: Session, joined: Session, number: int) -> dict[str, str]:
 
 
 def _counted_on(part: Measurements, added: Mapping[str, float], frames: int) -> Measurements:
-    """Return rows with a number added to each column: ``added``, column name -> number.
+    """Return rows with ``added[name]`` added to each value of the column ``name``.
 
-    ``frames`` is added to frame numbers; rows without a frame (-1) stay without one.
+    ``frames`` is added to the frame numbers; rows without a frame (-1) stay without one.
     """
     columns = {name: getattr(part, name) + more for name, more in added.items()}
     if part.frame is not None:
