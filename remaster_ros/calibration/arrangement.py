@@ -187,9 +187,11 @@ class Fitted:
 def arranged(session: Session, arrangement: Arrangement) -> Session:
     """Copy of a session with joints, points, labels, marker positions and tool rearranged.
 
-    The arrangement's shift and exchanged labels apply only to observations from its ``since``
-    (inclusive) to its ``until`` (exclusive). Rows that a shift leaves without joints are
-    dropped. The checksum of the observations is ''.
+    Joints and points get the order, signs, quarter turns and scales of the `Arrangement`,
+    marker positions its turn in the tool frame, and its ``tip_link`` replaces the session's
+    unless it is ''. Its shift and exchanged labels apply only to observations from its
+    ``since`` (inclusive) to its ``until`` (exclusive). Rows that a shift leaves without joints
+    are dropped. The checksum of the observations is ''.
     """
     m = session.measurements
     moved = replace(

@@ -187,9 +187,10 @@ def resolving_priors(
 ) -> list[str]:
     """Descriptions of the priors that fix each of d directions (size, d), one text each.
 
-    A text names all priors that have at least a thousandth of the strongest prior's pull along
-    the direction; `EFFECTS_PRIOR` stands for the prior on the extension's parameters. ``x``:
-    natural parameters, (size,).
+    A prior's pull is the norm of the derivative of its residuals along the direction. A text
+    names all priors with more than a thousandth of the strongest pull; `EFFECTS_PRIOR` stands
+    for the prior on the parameters of effects (``model.extension``). ``x``: parameters in
+    natural coordinates, rad and m, (size,).
     """
     core = replace(model, extension=None)
     names = [*(prior.description for prior in priors), EFFECTS_PRIOR]

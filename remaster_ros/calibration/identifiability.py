@@ -255,12 +255,14 @@ def _nearly_null(
 ) -> list[tuple[FloatArray, int, float]]:
     """Directions along which an angle has a standard deviation above a limit, the worst first.
 
-    Returns (direction, (size,); index of the angle; its std, rad or m) of each; after each one
-    its angle is taken as fixed, too. ``triangle``: of `_triangle`, divided by ``scale``,
-    (size,), with the effects' prior; ``pivots``: parameters taken as fixed; ``angles``: mask
-    of the parameters that count as angles, zeros of prismatic joints among them;
-    ``per_radian``: amount of each parameter that counts as a radian, (size,); ``limit``: rad.
-    The std must also reach ``factor`` times the median std of all angles, or `OPEN_ANGLE`.
+    Returns (direction, (size,), 1 at the angle; parameter index of the angle; its std, rad or
+    m) of each; [] if there is none. After each one its angle is taken as fixed, too. The std,
+    rad, must reach ``limit``, rad, and also the smaller of `OPEN_ANGLE` and ``factor`` times
+    the median std of the angles. ``triangle``: R of the QR decomposition of the data's
+    Jacobian with the effects' prior, columns divided by ``scale``, (size,); ``pivots``:
+    parameters taken as fixed; ``angles``: mask of the parameters that count as angles, zeros of
+    prismatic joints among them; ``per_radian``: amount of each parameter that counts as a
+    radian, (size,): 1 except for prismatic joints, in m.
     """
     found = []
     active = ~np.isin(np.arange(len(scale)), pivots)

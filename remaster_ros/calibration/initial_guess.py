@@ -88,12 +88,13 @@ def closest_start(
     marker_std_m: float,
     priors: Sequence[Prior],
 ) -> tuple[Model, FloatArray]:
-    """Better of two robust fits, however far the data are from the robot.
+    """Better of two robust fits, by the spread of errors, however far the data are from the robot.
 
     One fit begins with the markers at nominal, one with those of `_linear_markers`. Arguments
-    as of `robust_start`. Returns the model with reference registrations, and pinned parameters
-    (size,), whose registrations may differ from the reference. Raises InsufficientDataError if
-    a sensor's points do not fix a registration; never MisfitError.
+    as of `robust_start`. Returns the model with the registrations at the fit's start as
+    reference, and the fitted parameters in pinned coordinates (`Model.pinned`), (size,): the
+    outer joints at 0, registrations as corrections of the reference. Raises
+    InsufficientDataError if a sensor's points do not fix a registration; never MisfitError.
     """
     chain = model.chain
     tool = chain.forward(measurements.q[rows])

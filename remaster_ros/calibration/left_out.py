@@ -211,11 +211,13 @@ def _variance(gram: FloatArray, size: int, covariance: FloatArray) -> float:
 def held_out_tests(
     mode: Mode, measurements: Measurements, gross: IntArray
 ) -> tuple[StructureTest, ...]:
-    """Test for each sensor of a fit whether held-out poses are predicted worse.
+    """Test for each sensor of a fit whether held-out poses are predicted worse than fitted ones.
 
-    Separate tests for means of poses and for deviations; () without held-out rows or if all noise
-    is below 1 µm. ``mode``: of the posterior of the fitted rows; ``measurements``: all rows;
-    ``gross``: ``observation`` of each held-out row that is a gross error.
+    Each fitted pose is predicted by the fit without that pose; errors are in units of their
+    uncertainty. Separate tests for means of poses and for deviations from them, of sensors with
+    enough poses of either; () without held-out rows or if all noise is below 1 µm. ``mode``:
+    maximum of the posterior of the fitted rows; ``measurements``: all rows; ``gross``:
+    ``observation`` of each held-out row that is a gross error.
     """
     posterior = mode.linearisation.posterior
     kept = measurements.is_validation & ~np.isin(measurements.observation, gross)

@@ -244,7 +244,12 @@ class NoiseModel:
         return result
 
     def sums_of_squares(self, errors: FloatArray) -> FloatArray:
-        """Sum of squares in each error group, m², (..., error groups), of errors (..., n, 3)."""
+        """Sum of squares in each error group, m², (..., error groups), of errors (..., n, 3).
+
+        An error group has, of one channel, the deviations of rows from their frame's mean, those
+        of frames' means from their pose's mean, or the poses' means; means are scaled so that
+        they have the `variances`. rad² of orientations.
+        """
         # The rows first, in memory too: each sum is over long rows.
         values = np.moveaxis(errors.reshape(-1, *errors.shape[-2:]), 0, -1)
         values = np.ascontiguousarray(values)
@@ -276,13 +281,14 @@ class NoiseModel:
     def parts(
         self, features: Callable[[Rows, slice], FloatArray]
     ) -> Iterator[tuple[int, FloatArray]]:
-        """Yield (index of error group, columns (r, width)), whose C' C sum up to the Gram matrix.
+        """Yield (index of error group, columns C (r, width)), whose C'C sum up to its Gram matrix.
 
-        Columns are decorrelated and in the axes of the channels, not weighted by variances. A
-        group comes several times; of its sum the Gram matrices of the groups that it contains
-        (`contained`) are to be subtracted. ``features``: function from rows, and their slice
-        among all rows, to vectors (rows, 3, width) in the coordinates of `Rows.target`; called
-        with some thousand rows at a time, so that memory does not grow with their number.
+        A group comes several times. The sum of a group in `contained` also includes the Gram
+        matrices of the groups listed there, which the caller subtracts, as `gram` does. Columns
+        are decorrelated and in the axes of the channels, not divided by standard deviations.
+        ``features``: function from rows, and their slice among all rows, to vectors (rows, 3,
+        width) in the coordinates of `Rows.target`; called with about 2,000 rows (`GRAM_ROWS`) at
+        a time to bound the memory, or with all at once if rows are correlated along the path.
         """
         # Rows that are correlated along the path are taken whole.
         most = len(self.rows) + 1 if self.rows.decorrelation else GRAM_ROWS
@@ -372,7 +378,11 @@ class NoiseModel:
         return white
 
     def _of_groups(self, noise: Noise) -> FloatArray:
-        """Sigma, pose_sigma and frame_sigma of each group and axis, m, (3, groups, 3)."""
+        """Sigma, pose_sigma and frame_sigma of each group of rows and axis, m, (3, groups, 3).
+
+        First index: the three sigmas, in this order; groups: a sensor at one pose each, as in
+        `Rows`, not error groups; last index: axes of the channels. In rad for orientations.
+        """
         rows, parts = self.rows, np.ones((3, len(self.rows.group_size), 3))
         for index, channel in enumerate(self.channels):
             of_sensor, axes = rows.group_sensor == channel.sensor, slice(*channel.axes)

@@ -111,8 +111,11 @@ class Decorrelation:
     ) -> Decorrelation:
         """Matrices that decorrelate a sensor's rows, for runs of at most `MOST_FRAMES` frames.
 
-        ``source``, ``marker``: index in the measurements, and marker, of all n rows, (n,);
-        ``frame_start``, ``frame_size``: first row and number of rows of all frames;
+        Runs are equal parts of the sensor's frames, one after the other, and count as independent.
+        Each has a matrix for the means of its frames, and one for each marker's deviations from
+        these means; none for deviations if the sensor's ``marker_share`` is at most 0.001.
+        ``source``, ``marker``: index in the measurements, and index of the marker, of all n rows,
+        (n,); ``frame_start``, ``frame_size``: first row and number of rows of all frames;
         ``frames``: slice of the frames of the sensor.
         """
         runs = []

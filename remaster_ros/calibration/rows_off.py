@@ -37,10 +37,12 @@ class RowsOff:
 def find_rows_off(session: Session, most: int) -> RowsOff:
     """Comparison of every row, held-out rows as well, with a robust fit of optimization rows.
 
-    A row does not fit if it is gross with a probability above 99 % (`outliers.CERTAIN`); too many
-    are more than a tenth of a sensor's rows, and more than one. ``session``: with unknown marker
-    positions, as a firm wrong position would bend the fit; ``most``: largest number of fitted
-    rows, evenly spread. Raises InsufficientDataError if there are too few rows or poses.
+    A row does not fit if it is gross with a probability above 99 % (`outliers.CERTAIN`). One
+    flag for the session, ``too_many``, tells whether for any sensor more than a tenth of the
+    rows, and more than one, do not fit, of all its rows or of those that are not held out.
+    ``session``: with unknown marker positions, as a firm wrong position would bend the fit;
+    ``most``: largest number of fitted rows, evenly spread. Raises InsufficientDataError if
+    there are too few rows or poses.
     """
     problem = Problem.of(session)
     model, m = problem.empty_model(), problem.measurements

@@ -261,9 +261,11 @@ def _couple(text: str) -> tuple[str, tuple[str, Literal[1, -1]]]:
 
 
 def _stretch(text: str) -> Stretch:
-    """Argument type: what was moved, and between which observations, WHAT[@FROM-TO].
+    """Argument type: a change, and the observations that it applies to, WHAT[@FROM-TO].
 
-    Either end may be missing: None. ArgumentTypeError for another form.
+    The change is WHAT (a text that is not checked here) in observations from number FROM to
+    before TO. FROM, TO or all of @FROM-TO may be missing: None, no bound on that side. Raises
+    ArgumentTypeError for another form.
     """
     what, at, between = text.partition('@')
     since, dash, until = between.partition('-')

@@ -225,10 +225,11 @@ class Pairing:
     def end_as_recorded(self, result: str, reason: str) -> None:
         """Decide on every sensor now, at the point where the recorder of a bag had decided.
 
-        A sensor without a decision is decided by its readings if its time is over and they are
-        usable. Otherwise it is rejected: as ``absent`` if the recorder's result was
-        ``recorded``, else as ``stale``. ``result, reason``: as published by the recorder
-        (`events.ConfigurationEnded`); the reason becomes the detail of these rejections.
+        A sensor without a decision is decided by its readings if its time is over, they are
+        usable, and a joint state has come since the end of its measurement. Otherwise it is
+        rejected: as ``absent`` if the recorder's result was ``recorded``, else as ``stale``.
+        ``result, reason``: as published by the recorder (`events.ConfigurationEnded`); the reason
+        becomes the detail of these rejections.
         """
         for name, rules in self.rules.items():
             if name in self.decided:

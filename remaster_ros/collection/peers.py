@@ -188,7 +188,9 @@ class Peers:
         """Facts on a sensor: age of node and reading, s, whether it is ready, and its message.
 
         A sensor without a report is not ready, and its node infinitely old. The age of the reading
-        is 0 for every sensor if `seen_before`, infinite if there was none. ``now``: wall time, s.
+        is 0 if ``seen_before``; else its age in the recorder's last state plus the time since that
+        state; infinite if the recorder has sent no state or has no reading of the sensor. ``now``:
+        wall time, s.
         """
         nothing = SensorReport(sensor=name, ready=False), -NEVER_S
         report, came = self._reports.get(name, nothing)

@@ -157,10 +157,10 @@ class SetupChanges:
     def follow(self, state: str, run: str) -> bool:
         """Process the planner's state; returns whether a person has checked the change.
 
-        A person has if a change has stopped a run, and another run is under way, as by
+        True if a change has stopped a run, and a run with another token is under way, as after
         /remaster/collect. A restarted recorder does not know which run was stopped
-        (`stopped_run` is ''): it takes the run that it finds running for that one or, if the
-        planner is paused, a run that differs from every later one; the result is False then.
+        (`stopped_run` is ''): the result is then False, and `stopped_run` becomes ``run`` if the
+        planner is running, `PAUSED` (the token of no run) if it is paused; else it stays ''.
         ``state, run``: the planner's state and the token of its run, '' for none.
         """
         if self.stopped_run == '':

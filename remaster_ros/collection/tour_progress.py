@@ -28,7 +28,10 @@ class PlanMemory(Protocol):
     decided: Decided
 
     def begin(self, tour: Tour, expected: Expected | None = None) -> None:
-        """Begin a tour; ``expected``: expected precision of its fit."""
+        """Record a tour as begun: `tour` is then a copy with no pose visited, and `visit` is None.
+
+        ``expected``: expected precision of its fit; None if it is not known.
+        """
 
     def open_visit(self, visit: PoseVisit) -> None:
         """Begin a visit, which becomes `visit`, and is kept before the arm moves."""

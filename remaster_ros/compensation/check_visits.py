@@ -134,20 +134,22 @@ def read_visits(path: Path, cell: Workcell, chain: SerialChain) -> CheckVisits:
         raise InputError(
             f'{path}: is no text; give the table of `remaster plan --check`'
         ) from None
-    header, *rows = [row for row in csv.reader(text.splitlines()) if row] or [[]]
+    lines = [(i, row) for i, row in enumerate(csv.reader(text.splitlines()), 1) if row]
+    (_, header), *rows = lines or [(1, [])]
     named = columns_of(chain)
     if header != named:
         raise InputError(f'{path}, line 1: is not {",".join(named)}; choose the poses of this arm')
     if len(rows) != CHECK_POSES:
         raise InputError(f'{path}: has {len(rows)} configurations, and a check has {CHECK_POSES}')
     q = np.empty((len(rows), len(chain)))
-    for number, row in enumerate(rows, 2):
+    for index, (line, row) in enumerate(rows):
         try:
-            q[number - 2] = np.array([float(cell) for cell in row]) / chain.shown_scale
+            values = [float(cell) for cell in row]
         except ValueError:
-            raise InputError(
-                f'{path}, line {number}: does not have {len(chain)} numbers'
-            ) from None
-        if not bool(chain.within_limits(q[number - 2][None])[0]):
-            raise InputError(f"{path}, line {number}: is outside the joints' limits")
+            values = []
+        if len(values) != len(chain) or not np.all(np.isfinite(values)):
+            raise InputError(f'{path}, line {line}: does not have {len(chain)} numbers')
+        q[index] = np.array(values) / chain.shown_scale
+        if not bool(chain.within_limits(q[index][None])[0]):
+            raise InputError(f"{path}, line {line}: is outside the joints' limits")
     return chosen_visits(cell, chain, q, None, np.random.default_rng(0))

@@ -649,10 +649,11 @@ def _moved(
 ) -> tuple[float, bool]:
     """RMS displacement of the markers, m, that new sensor poses make, and whether sensors moved.
 
-    Moved: more than ``smallest_m`` and than noise explains at 5 standard deviations
-    (`BEYOND_STD`). ``before``: earlier T_R_N by sensor; a sensor without one counts as
-    unmoved; ``last``: newest check, with its readings ``measured``; ``noise``: of a reading
-    per axis, m; ``residuals_of_checks``: number of checks that give the noise.
+    Over the readings ``measured`` of the newest check ``last``; ``before``: earlier T_R_N by
+    sensor; a sensor without one counts as unmoved. Moved: the RMS is more than ``smallest_m``,
+    and the sum of squares more than ``noise`` (of a reading per axis, m) explains at 5 standard
+    deviations (`BEYOND_STD`). ``residuals_of_checks``: number of checks, which times
+    ``last.freedom`` counts as the degrees of freedom of ``noise``.
     """
     shift = np.zeros_like(measured.position)
     for sensor, T in last.T_R_N.items():

@@ -477,7 +477,12 @@ def _of_links(candidate: Candidate, chain: SerialChain) -> Iterator[tuple[Slot, 
 
 
 def _of_base(candidate: Candidate) -> Iterator[tuple[Slot, FloatArray]]:
-    """Yield slots and matrices of a candidate that turns the base; none if it has no place."""
+    """Yield the slots of a candidate that turns the base, each with a matrix to coefficients.
+
+    A slot is a term of an `ArmModel`; the matrix leads from the candidate's m parameters to the
+    term's coefficients, (coefficients, m). Nothing if no term has the candidate's driver and
+    form.
+    """
     if candidate.driver == 'gravity_moment' and candidate.form == 'linear':
         axes = {'isotropic': np.ones((3, 1)), 'by axis': np.eye(3)[:, :2]}
         if candidate.variant in axes:

@@ -88,12 +88,13 @@ def corrected_trajectory(
 ) -> CorrectedTrajectory:
     """Trajectory to send to the controller for a wanted trajectory of the nominal robot.
 
-    Points are added, and time is stretched if a limit requires it. ``compensator``: the
-    correction; ``times_s``: ascending, (n,), n >= 2; ``positions, velocities``: wanted, rad
-    and rad/s, (n, k); ``tolerance_m``: largest deviation of the tool between points;
-    ``velocity_limits, acceleration_limits``: rad/s and rad/s², (k,); None for those of the
-    URDF, and for no limit; ``temperature_c``: of the arm; ``begins``: command at the start,
-    rad, (k,); None for the best command there.
+    Points are added. If a limit requires it, less is corrected between the ends, and the whole
+    trajectory is slowed down by one factor. ``compensator``: the correction; ``times_s``:
+    ascending, (n,), n >= 2; ``positions, velocities``: wanted, rad and rad/s, (n, k);
+    ``tolerance_m``: largest deviation of the tool between points; ``velocity_limits,
+    acceleration_limits``: rad/s and rad/s², (k,); None for those of the URDF, and for no limit;
+    ``temperature_c``: of the arm; ``begins``: command at the start, rad, (k,); None for the best
+    command there.
 
     Raises InputError for numbers that are not finite, times that do not ascend, other shapes,
     or a path whose correction cannot be followed with a point per millisecond.

@@ -342,8 +342,9 @@ def _single_joint_alternatives(
 def _expected(step: FloatArray, unsure: FloatArray, sigma: float) -> float:
     """Expected log odds between two states whose predictions differ by a step, m, (d,).
 
-    ``unsure``: effects of uncertain parameters, (d, r), projected as the step; ``sigma``:
-    noise of a reading per axis, m.
+    step' C^-1 step / 2, C = sigma² + unsure unsure'. ``unsure``: displacements by one standard
+    deviation of each of r uncertain parameters, m, (d, r), in the coordinates of the step
+    (`_ProjectedRows.projected`); ``sigma``: noise of a reading per axis, m.
     """
     covariance = sigma**2 * np.eye(len(step)) + unsure @ unsure.T
     return 0.5 * float(step @ np.linalg.solve(covariance, step))

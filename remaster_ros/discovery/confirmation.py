@@ -447,11 +447,12 @@ class _Both:
 
     @cached_property
     def _of_the_other(self) -> tuple[FloatArray, float]:
-        """Products of the other session's equations, and a term to subtract from the log evidence.
+        """Matrix X'WX of the other session, and a term to subtract from the log evidence.
 
-        If `share` is above 0, the other session has arm errors of its own, with that share of the
-        prior variance: they are marginalised, see `_Measured.apart`. If it is 0, these are its
-        `products` unchanged, and 0.
+        Rows and columns as in `_Measured.products`. If `share` is above 0, the other session has
+        arm errors of its own, with that share of the prior variance: they are marginalised, and
+        the term is half the log determinant of their posterior over prior precision, see
+        `_Measured.apart`. If it is 0: the other session's `products` unchanged, and 0.
         """
         if self.share == 0.0:
             return self.there.products, 0.0
@@ -927,10 +928,11 @@ def in_words(discovery: Discovery, confirmation: Confirmation) -> list[str]:
 
 
 def _said(cause: ConfirmedCause) -> str:
-    """Return the answer on a cause, and its errors in the other session, as text.
+    """Return the answer on a cause as text, with the errors in the other session.
 
-    To follow the cause's title: begins with '. ' or ': '. A cause that happened once is said to
-    be no matter of that session.
+    The errors are RMS in mm, in that session without the cause and with it as found in this
+    one. The text follows the title of the cause: it begins with '. ' or ': '. It has no errors
+    if the other session cannot tell, or if the cause happened once, in this session only.
     """
     evidence, without, frozen = cause.log_evidence, cause.rms_without_m, cause.rms_frozen_m
     if evidence is None or without is None or frozen is None:

@@ -201,10 +201,11 @@ class System:
         return self.value(eta) + 0.5 * float(np.sum(np.log(prior)))
 
     def most_likely(self, start: Mapping[object, float], noise: Noise | None) -> FloatArray:
-        """Return the coordinates eta, logs of noise and smoothness, that maximise L, (e,).
+        """Return logs eta of noise and smoothness that maximise the restricted likelihood, (e,).
 
-        ``start``: smoothness of candidates by key, and ``noise``: to begin at; others, or
-        None, begin at a first guess.
+        Smoothness is the factor of a candidate's penalty. ``start``: its value by key of
+        candidate, and ``noise``: at which the search begins; a candidate not in ``start``, and
+        noise None, begin at a first guess. Raises LinAlgError if columns cannot be distinguished.
         """
         return self._most_likely(*self._start(start, self.guess if noise is None else noise))
 

@@ -126,7 +126,10 @@ class _Checks:
         return at_neighbour & self.gross
 
     def _series(self) -> Iterator[IntArray]:
-        """Yield the row indices of each sensor and marker in the order of time; may be empty."""
+        """Yield the row indices of each pair of sensor and marker, in the order of time.
+
+        The array of a pair without rows is empty.
+        """
         context = self.data.context
         for sensor in range(len(context.sensor_names)):
             for marker in range(len(context.marker_names)):

@@ -271,8 +271,10 @@ def evaluated(
 ) -> Evaluated | None:
     """Fit a model at the noise and background variances that maximise its likelihood.
 
-    ``families``: the background; ``model``: blocks of ``pool`` with levels; ``start``: where
-    the search begins. None if its columns cannot be distinguished.
+    ``families``: kinds of errors that are the background, as random effects; ``model``: (index
+    of a block in ``pool``, level: index of its prior size in `LEVELS_M`) each; ``start``: fit
+    at whose variances the search begins, None for a first guess. None if the columns of the
+    model cannot be distinguished.
     """
     candidates = [pool.blocks[block].weights(level) for block, level in model]
     system = System.of(pool.data, [*candidates, *(family.candidate for family in families)])
@@ -508,12 +510,13 @@ class Walk:
         return [(block, int(np.argmax(state.gains[block]))) for block in causes.values()]
 
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
-        """Add likely changes in mid-session to the pool; return models with the likeliest one.
+        """Add likely changes in mid-session to the pool; return models with the best one added.
 
-        ``changes``: candidates that begin or end at a moment. A change is likely if it nearly
-        raises the log posterior, added to the best model of a chain or in place of one of its
-        blocks. Each best model is tried with its background, and without the wander of sensors,
-        which imitates any change. [] if no change is likely.
+        ``changes``: candidates that begin or end at a moment. A change is likely if, added to the
+        best model of a chain or in place of one of its blocks, it changes the log posterior by
+        more than -`NEEDED`. Each best model is tried with its background, and without the wander
+        of sensors, which imitates any change; it returns with the change that gains most when
+        added, if that is in the pool. [] if no change is likely.
         """
         blocks, found = blocks_of(self.data, changes), []
         for best in [chain.best for chain in self.chains] if blocks else []:

@@ -70,8 +70,9 @@ def likely_tips(model: UrdfModel, base_link: str, names: Container[str] = ()) ->
     The arm is the chain from the base with the most joints. Joints of a gripper's jaws and fingers
     are not counted, nor prismatic joints behind five revolute ones that carry none.
 
-    ``names``: joints that are known to be the arm's, such as those of a table: the arm is then the
-    chain with the most of them, and only prismatic joints among them count.
+    ``names``: joints that are known to be the arm's, such as those of a table: if the robot has
+    any of them, the arm is the chain with the most of them, and of prismatic joints only those
+    among them count.
 
     Raises
     ------

@@ -68,7 +68,8 @@ def difference(chain: SerialChain, description: str) -> str:
 def axes_apart(chain: SerialChain, description: str) -> float:
     """Return the root sum of squares of the angles between an arm's axes and a description's, rad.
 
-    Infinite if the description lacks a joint of the arm, or has them in another order.
+    Of directions with all joints at zero; a large angle counts as 2 sin(angle / 2). Infinite if
+    the description is no valid URDF, lacks a joint of the arm, or has them in another order.
     """
     read = _read(chain, description)
     if isinstance(read, str):

@@ -505,8 +505,8 @@ class ArmSupervisor:
     def _engaged(self) -> bool:
         """Whether trouble with the robot halts: a collection, a move or a stop is under way.
 
-        The collection must run with a person's consent; a settled configuration that waits for
-        its answer counts as a move.
+        Of these only a collection needs a person's consent to count; a consent that is held is
+        enough. A settled configuration that waits for its answer counts as a move.
         """
         return self._interlocks.collecting or self.busy or self.state is Arm.BRAKES
 

@@ -150,10 +150,10 @@ class Interlocks:
         self.say(Word.HINDERED)
 
     def stopped_on_its_way(self, wall_s: float) -> None:
-        """Process that the arm stops on its way without any reason not to move.
+        """Set a given consent to move to `Consent.HELD`: the arm stops with no reason not to move.
 
-        The consent, if it is given, is held from ``wall_s`` on, now, s; `look_at_interruption`
-        decides whether a person has to go on.
+        Held from ``wall_s``, now, s. `look_at_interruption` then gives it again, or asks for a
+        person, who must call /remaster/collect. Nothing happens if the consent is not given.
         """
         if self.consent is Consent.GIVEN:
             self._held_since_wall, self._released = wall_s, self._is_released

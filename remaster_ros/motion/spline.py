@@ -95,7 +95,7 @@ class Spline:
 
     @property
     def straight_until(self) -> float:
-        """Share at which the straight piece at the beginning ends."""
+        """Share at which the straight piece ends with which every curve begins; above 0."""
         return float(self.knots[1])
 
     @property

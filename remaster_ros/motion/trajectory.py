@@ -270,9 +270,10 @@ class Curve(RampedPath):
 def allowed_rates(limits: MotionLimits, spline: Spline) -> FloatArray:
     """Return the largest rate of the share at each sample of a spline, 1/s, (p,).
 
-    By `HEADROOM` times the speeds and accelerations, the latter also of a stop in `RAMP_S`
-    from there. On the straight piece at the beginning also by the accelerations of ramps as of
-    `Line.within`, with `STOPPABLE`. The limit of the speed of points is not looked at.
+    Within `HEADROOM` times the joints' limits of speed, and of acceleration also during a stop
+    in `RAMP_S` from there. On the straight piece at the beginning, a ramp of `RAMP_S` from rest
+    to the rate also takes at most `HEADROOM` times `STOPPABLE` of the acceleration limits, as
+    of a `Line`. The limit of the speed of points (``tool_speed``) is not considered.
     """
     shares, _ = spline.samples
     first, second = (np.abs(spline.at(shares, order)) for order in (1, 2))
@@ -286,7 +287,7 @@ def allowed_rates(limits: MotionLimits, spline: Spline) -> FloatArray:
 
 
 def _ramp(time_s: float) -> tuple[float, float]:
-    """Return a speed that goes from 0 to 1 in `RAMP_S`, and its integral, s.
+    """Return a speed that rises linearly from 0 to 1 in `RAMP_S`, and its integral, s.
 
     ``time_s``: from the ramp's start, s; 0 before, and 1 after `RAMP_S`.
     """

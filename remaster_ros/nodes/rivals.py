@@ -91,7 +91,10 @@ class OnlyPublisher:
         self._alive = change.alive_count
 
     def _words(self, listed: list[TopicEndpointInfo]) -> str:
-        """Sentence on publishers that are too many on the topic, with their nodes."""
+        """Sentence on publishers that are too many on the topic, with their nodes.
+
+        ``listed``: all that the ROS graph lists, those of killed processes included.
+        """
         names = sorted(node_of(info) for info in listed)
         count = '1 publisher' if len(listed) == 1 else f'{len(listed)} publishers'
         may = 'one' if self._allowed else 'none'

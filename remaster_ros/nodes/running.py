@@ -351,10 +351,11 @@ def run(
 
 
 def spin_once(executor: Executor, node: RemasterNode, timeout_s: float) -> None:
-    """Execute the callbacks that are due; an uncaught exception goes to the node's `on_fault`.
+    """Execute one callback that is due, or give it to the executor's threads, if it has several.
 
-    A RemasterError becomes the node's `failure` unless the node outlives faults. Returns after
-    `timeout_s` at most if none is due. Raises ExternalShutdownException as rclpy.
+    An uncaught exception goes to the node's `on_fault`; a RemasterError becomes its `failure`
+    unless the node outlives faults. With threads it may be that of an earlier callback. Returns
+    after `timeout_s` at most if none is due. Raises ExternalShutdownException as rclpy.
     """
     try:
         executor.spin_once(timeout_sec=timeout_s)

@@ -72,9 +72,11 @@ class DesignSettings:
         return replace(self, sensors=tuple(placed))
 
     def information(self, scene: PlanningScene, poses: Sequence[PlannedPose]) -> DesignInformation:
-        """Return the information of poses in all their solutions by these sensors and priors.
+        """Return the Fisher information of poses, each in all its joint solutions, for a fit.
 
-        Raises as `DesignInformation.of`.
+        The arm is the scene's, nominal; sensors, priors and tool box are those of these settings.
+        Raises InputError without any solution, or without one with the tool in the box, and
+        InsufficientDataError if all solutions together do not determine the parameters.
         """
         chain = scene.model.chain
         return DesignInformation.of(

@@ -363,9 +363,10 @@ class _Search:
     def with_other_poses(self, chosen: Sequence[int], rng: np.random.Generator) -> list[int]:
         """Return a random exchange: a pose added, or a few removed and the design filled up.
 
-        Each with probability 1/2; up to four poses are removed, and the design is filled up to
-        at most `MOST_MORE` configurations more than it had. Unchanged if no pose is left to
-        add. ``chosen``: indices of units.
+        Each with probability 1/2. An added pose comes with all its units; with none left to add
+        the design is unchanged. If poses are removed, they are one to four, and units are added
+        (`filled`) until the design reaches its goals or has `MOST_MORE` configurations more than
+        before; the last unit may exceed that. ``chosen``: indices of units. A new list.
         """
         pose = self._information.pose
         poses_in = np.unique(pose[np.array(chosen, dtype=np.int64)])

@@ -112,11 +112,13 @@ def _shown(joint: Mapping[str, Any], key: str) -> str:
 def _joint(
     robot: str, name: str, index: int, rows: Sequence[Mapping[str, Any]], level: float
 ) -> dict[str, Any]:
-    """Row of a joint for the page: median, spread, sessions that differ, lasting change.
+    """Row of a joint for the page, on its zero-offset in the sessions of one kind of arm.
 
-    Values are None, and lists and texts empty, if unknown; with fewer than `FEW` sessions only
-    median and spread are known. ``index``: of the joint in each row, from 0; ``rows``: done
-    sessions of one kind of arm; ``level``: of `differing`.
+    Median and spread of the offset, sessions that differ, lasting change; keys of values end in
+    the unit, 'deg' or 'mm'. Unknown values are None, under '_deg' for any unit; lists and texts
+    are empty then. With fewer than `FEW` offsets only median and spread are known. ``index``:
+    of the joint in each row, from 0; ``rows``: done sessions; ``level``: probability that any
+    session is named if none differs.
     """
     unit = rows[0]['fit']['joints'][index].get('unit', 'deg')
     known = [row for row in rows if row['fit']['joints'][index].get(f'mean_{unit}') is not None]

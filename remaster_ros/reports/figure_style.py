@@ -103,7 +103,7 @@ def as_svg(figures: dict[str, Callable[[Drawn], Figure]], subject: Drawn) -> dic
 def evenly(count: int, most: int) -> IntArray:
     """At most ``most`` of the numbers 0 to count - 1, evenly spaced, ascending, with both ends.
 
-    [] for a count of 0.
+    [] for a count of 0; 0 alone if ``most`` is 1.
     """
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(np.int64))
 

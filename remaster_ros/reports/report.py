@@ -226,9 +226,11 @@ def _fitted_left_out(inputs: Inputs, answer: Answer) -> int:
 
 
 def worst_rows(inputs: Inputs, answer: Answer) -> list[WorstRow]:
-    """Return the rows with the largest errors after the action, at most 10 (`WORST_ROWS`).
+    """Return the rows with the largest errors after correction, at most 10 (`WORST_ROWS`).
 
-    The largest first.
+    The largest first, of all rows of the session, fitted and held out. Errors are
+    ``answer.final_mm``: with the zero-offsets, and with the causes or the robot model if the
+    answer uses them; also if the action is to set nothing.
     """
     session, m = inputs.session, inputs.session.measurements
     final = answer.final_mm

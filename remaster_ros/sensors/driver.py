@@ -84,7 +84,10 @@ class Driver(ABC):
 
     @property
     def connected(self) -> bool:
-        """Whether the device can be reached after `open`; if False it is opened again."""
+        """Whether the device can be reached after `open`; if False it is opened again.
+
+        Always True unless a driver overrides it, as one that can notice a lost connection does.
+        """
         return True
 
     @abstractmethod

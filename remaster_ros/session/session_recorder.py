@@ -438,10 +438,12 @@ class SessionRecorder:
         self._record_unreached()
 
     def _on_planner(self, planner: events.PlannerState) -> None:
-        """Process the planner's state: its run, and a change that a person has accepted.
+        """Process the planner's state: its run, and a person's consent to a change of the set-up.
 
-        While no reading is under way and the disk has room, the session is closed when the
-        planner completes or stops, and reopened when it resumes or adds measurements.
+        The consent is recorded unless the disk is full or the session closed. While no reading is
+        under way and the disk has room, the session is closed when the planner completes, or stops
+        after an observation, and reopened when a stopped run resumes or measurements are added to
+        a complete one.
         """
         self.run = planner.run_held(self.run)
         accepted = self.changes.follow(planner.state, self.run)

@@ -112,9 +112,11 @@ def _draw_curve(kind: str, context: DrawContext) -> HiddenEffect:
 
 
 def _draw_link(kind: str, context: DrawContext) -> HiddenEffect:
-    """Draw an error of ±5 mm of the link behind one of joints 1 to k - 1.
+    """Draw an error of 5 mm, with a random sign, of the link behind one of joints 1 to k - 1.
 
-    Along the link or along x, y or z of the frame after the joint (``axis`` in the detail).
+    Along the link, or along x, y or z of the frame after the joint: ``axis`` of the detail is
+    'along', 'x', 'y' or 'z'. ``kind``: name of the effect. Raises ValueError for an arm of one
+    joint.
     """
     joint = int(context.rng.integers(1, context.joints))
     segment = context.circumstances.segments[joint]

@@ -75,7 +75,8 @@ class Arm(Protocol):
     def segments(self) -> FloatArray:
         """Vectors from the base to joint 1, from joint to joint, and to the tool, m, (k + 1, 3).
 
-        As drawn. Row j is in the frame after joint j, row 0 in that of the base.
+        Of the nominal arm, without hidden errors. Row j is in the frame after joint j, row 0 in
+        that of the base.
         """
 
 

@@ -11,7 +11,11 @@ from remaster_ros.types import FloatArray
 
 
 def candidates(context: Context) -> Iterator[Candidate]:
-    """Yield a candidate for each joint that turned: δq_j = s_j τ_j, τ_j: inertial torque, N m."""
+    """Yield a candidate for each revolute joint that moved in the rows to fit (`Context.turning`).
+
+    δq_j = s_j τ_j, s_j: compliance to be fitted, rad/(N m); τ_j: torque of the links' inertia
+    forces about the joint, N m.
+    """
     return EFFECT.at_joints(
         context,
         context.turning,

@@ -36,8 +36,9 @@ RARITY = 3
 def candidates(context: Context) -> Iterator[Candidate]:
     """Yield a slow, a middling and a fast random drift for each sensor with enough readings.
 
-    Correlation lengths are `LENGTHS`, shares of the session. None for sensors of the kind
-    'controller' or with fewer than `FEWEST_READINGS` readings.
+    Correlation lengths are `LENGTHS`, shares of the session's rows in the order of time
+    (`Context.progress`), not of its duration. None for sensors of the kind 'controller' or with
+    fewer than `FEWEST_READINGS` readings.
     """
     for index, name in context.sensors('controller'):
         mine = context.seen_by(index)

@@ -240,10 +240,11 @@ def _moving_tracks(
     """Tracks of the moving markers, joined from pieces, and the number of pieces left out.
 
     Motive gives a marker that it lost a new number: that begins a new piece. A piece is joined
-    to the nearest marker within 10 mm (`_Track.distance`), else it begins a new one. Markers
+    to the nearest marker within 10 mm (`_Track.distance`), else it begins a new marker. Markers
     that stay in their place are left out. The others are taken as one if never two are seen at
     once; else only those seen in over half of the frames with any of them are kept, which may
-    be none. `groups`: label -> columns of a piece in `table`; `commas`: whether numbers have
+    be none. Pieces left out are those of all markers without a track here; empty pieces do not
+    count. `groups`: label -> columns of a piece in `table`; `commas`: whether numbers have
     decimal commas; `unit`: of length, '' for m.
     """
 

@@ -55,7 +55,8 @@ def open_socket(
 
     ``purpose, remedy``: purpose of the port and parameter to change, for the error message;
     ``shared``: whether other programs may listen on the same port (multicast). Raises DeviceError
-    if the port is in use, or the address is not one of this machine.
+    if the socket cannot be opened: the port is in use, the address is not one of this machine, or
+    the system refuses for another reason.
     """
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:

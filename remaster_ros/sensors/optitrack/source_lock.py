@@ -111,9 +111,10 @@ class SourceLock:
 
         FOREIGN if the source `is_refused`; BELIEVED if it has the lock. While no source has
         it, the last holder gets it back with its next frame (BELIEVED). Another source gets it
-        only after an `answer`, once it has sent `PROBATION_FRAMES` frames over at least
-        `PROBATION_S`, and no other candidate was heard in the last `silence_s`; until then the
-        verdict is PROBATION. ``now_s``: time of the frame, s.
+        only after the server has answered on its command channel (`answer`), once the source has
+        sent `PROBATION_FRAMES` frames over at least `PROBATION_S`, and no other candidate was
+        heard in the last `silence_s`; until then the verdict is PROBATION. ``now_s``: time of the
+        frame, s.
         """
         if self.is_refused(source, now_s):
             return SourceVerdict.FOREIGN

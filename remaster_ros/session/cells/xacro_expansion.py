@@ -218,8 +218,9 @@ class Expansion:
     def _parsed(self, given: Any, filename: str = '') -> Any:
         """Return the parsed XML of the file ``filename``, in place of xacro.parse.
 
-        ``given``: argument of xacro.parse that is not used. Raises InputError if the file
-        declares entities or cannot be read, XacroException if there is no such file.
+        ``given``: argument of xacro.parse that is not used. Raises InputError if the file has a
+        DOCTYPE or declares entities, or is unreadable, too large or not UTF-8; ExpatError if it is
+        malformed XML; XacroException if there is no such file.
         """
         path = Path(filename)
         if not path.exists():

@@ -230,7 +230,8 @@ class _Evaluation:
 def _item(holder: Any, key: Any) -> Any:
     """Return an item of a list, tuple, dictionary or text.
 
-    Raises ExpressionError if a dictionary lacks the key, IndexError or TypeError for other values.
+    Raises ExpressionError if a dictionary lacks the key, IndexError for an index out of range,
+    TypeError for a key of a wrong type or a holder that has no items.
     """
     if isinstance(holder, dict) and key not in holder:
         raise ExpressionError(f'there is no item {key!r}')
@@ -268,9 +269,9 @@ def _count(value: Any, budget: int) -> int:
 
 
 def _length(value: Any) -> int:
-    """Return the size of a value: bits of an integer, or number of characters or items.
+    """Return the size of a value: bits of an integer, or length of a text, list or tuple.
 
-    0 for other values.
+    0 for other values, dictionaries among them.
     """
     if isinstance(value, int):
         return value.bit_length()

@@ -194,9 +194,9 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
 
 
 class PlanJournal:
-    """Journal of a planner; a method returns when its record is on the disk.
+    """Journal of a planner: each method writes its record through to the disk before it returns.
 
-    If the disk is full (`trouble`), records are kept in memory until `write_out` succeeds.
+    If the disk is full (`trouble`), records wait in memory until `write_out` succeeds.
 
     Parameters
     ----------
@@ -386,7 +386,8 @@ class PlanJournal:
     def record_state(self, state: str, run: str = '') -> None:
         """Set `state` and `run` (token of the run, '' for none), and record them.
 
-        They are recorded only if one has changed and there is a plan.
+        They are recorded only if one has changed and there is a plan. On a full disk the record is
+        kept for later, and `trouble` has the reason; DiskError is not raised.
         """
         before, (self.state, self.run) = (self.state, self.run), (state, run)
         if self._journal is not None and before != (state, run):

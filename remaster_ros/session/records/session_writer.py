@@ -452,9 +452,10 @@ class SessionWriter:
         self.beyond_repair = 'the folder was removed, and with it the bag and the plan'
 
     def _accept(self, keys: Sequence[RowKeys]) -> None:
-        """Update next free numbers, last stamp and rules by rows that are on the disk.
+        """Update next free numbers, last stamp and sequence rules by rows that are on the disk.
 
-        ``keys``: of these rows, in their order.
+        The rules (`SequenceRules`) note the rows, to check later ones against them; the rows
+        themselves are not checked here. ``keys``: of these rows, in their order.
         """
         for key in keys:
             self._rules.accept(key)
