@@ -176,7 +176,7 @@ def _start(chain: SerialChain, angles: FloatArray) -> FloatArray:
     q = np.zeros(len(chain))
     known = min(len(chain), len(angles))
     q[:known] = angles[:known]
-    q[chain.slides] = 0.5 * (chain.lower + chain.upper)[chain.slides]
+    q[chain.slides] = 0.5 * (chain.lower[chain.slides] + chain.upper[chain.slides])
     return q
 
 

@@ -186,14 +186,16 @@ class Cell:
         return read_session(self.session)
 
     def check(self, session, lost=0):
-        """Each row once, where the truth has its marker; so many configurations may be lost."""
+        """Each row once, where the truth has its marker; up to ``lost`` configurations are lost."""
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         m, truth = session.measurements, self.world.truth
-        for index, name in enumerate(session.sensor_names):
-            mine = m.sensor == index
-            expected = truth.without_noise(chain, name, m.q[mine])
-            assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), name
-        pairs = list(zip(m.configuration.tolist(), m.sensor.tolist()))
+        seen = list(zip(m.sensor.tolist(), m.marker.tolist()))
+        for sensor, marker in sorted(set(seen)):
+            mine = (m.sensor == sensor) & (m.marker == marker)
+            names = session.sensor_names[sensor], session.marker_names[marker]
+            expected = truth.without_noise(chain, names[0], m.q[mine], names[1])
+            assert np.all(np.linalg.norm(m.position[mine] - expected, axis=1) < 0.4e-3), names
+        pairs = list(zip(m.configuration.tolist(), seen))
         assert len(set(pairs)) == len(pairs)
         count, planned = len(set(m.configuration.tolist())), self.planned()
         assert planned > 3
