@@ -186,7 +186,7 @@ class Cell:
         return read_session(self.session)
 
     def check(self, session, lost=0):
-        """Each row once, where the truth has its marker; up to ``lost`` configurations are lost."""
+        """Each row once, where the truth has its marker; up to ``lost`` configurations lost."""
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
         m, truth = session.measurements, self.world.truth
         seen = list(zip(m.sensor.tolist(), m.marker.tolist()))
