@@ -30,9 +30,9 @@ class Bounds:
     remedy: str = ''
 
     def problem(self, key: str, value: float) -> str:
-        """Return what is wrong with a value, in one line with the remedy; '' if it is valid.
+        """Error message for an invalid value, a line with the remedy; '' if the value is valid.
 
-        ``key``: name of the value in that line. NaN and infinite values are wrong.
+        ``key``: name of the value in that line. NaN and infinite values are invalid.
         """
         if not math.isfinite(value):
             return f'{key}: {value} is not a finite number; correct it'

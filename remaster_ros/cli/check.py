@@ -462,7 +462,7 @@ def _named(found: CheckResult, names: list[str]) -> str:
 
 
 def _text(content: dict[str, Any]) -> str:
-    """Return what ``remaster check`` prints: verdict, a line per joint, evidence and noise.
+    """Text that ``remaster check`` prints: verdict, a line per joint, evidence and noise.
 
     ``content``: as returned by `content_of`.
     """

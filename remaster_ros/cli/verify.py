@@ -271,7 +271,7 @@ def _in_words(found: VerificationResult) -> str:
 
 
 def _text(found: VerificationResult) -> str:
-    """Return what ``remaster verify`` prints: the verdict, then a line for each figure.
+    """Text that ``remaster verify`` prints: the verdict, then a line for each figure.
 
     Figures: shares of the correction that act, of all joints and of each; mean errors off and
     on, mm, each if there are such rows; RMS of what remains, mm.

@@ -1,1 +1,1 @@
-"""What the joint offsets leave unexplained, and its physical cause."""
+"""Errors that the joint offsets leave unexplained, and their physical causes."""

@@ -1,4 +1,4 @@
-"""What further measurements have decided between two causes that could be mistaken for each other.
+"""Decision between two causes that could be mistaken for each other, by further measurements.
 
 Both are fitted beside everything else that was found, one in the place of the other. The
 difference of their log evidence are the odds; with both as likely beforehand, they are also stated

@@ -1,4 +1,4 @@
-"""What the simulation gets wrong: its cause by name, the model extended by it, the gain measured.
+"""Discovery of the causes of errors: their names, the model extended by them, the gain measured.
 
 A walk over models (`walk`) finds which sets of causes explain the residuals, beside a background
 of all kinds of errors. The best model is sampled on all rows; what the other models would do to

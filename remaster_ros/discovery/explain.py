@@ -49,7 +49,7 @@ CHANGED = (
     'Find what was changed at that moment: a payload put on or taken off, a setting of the '
     'controller, something that came loose. Measure before and after it in sessions of their own.'
 )
-"""What to do about a cause that begins or changes in mid-session."""
+"""Remedy for a cause that begins or changes in mid-session."""
 
 
 class Parameter(Struct, frozen=True):

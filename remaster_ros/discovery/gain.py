@@ -1,4 +1,4 @@
-"""What the causes gain: on held-out poses, against the noise, metric by metric."""
+"""Gain by the causes: on held-out poses, against the noise, metric by metric."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the discovery works on: the residuals of the offsets model, its noise, its absorption.
+"""Residuals of the offsets model that discovery works on, with their noise and absorption.
 
 The noise is that of `calibration.noise`, with the directions that the fit distinguishes. What
 registrations, offsets and markers can absorb is projected out with flat priors, but for steps of

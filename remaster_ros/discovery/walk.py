@@ -82,7 +82,7 @@ WEAKEST, MOST_FIRST = 4, 20
 
 
 Identity = tuple[str, tuple[int, ...], str, str, str, str]
-"""What makes a cause: name, joints, place, driver, subject, and if it begins or ends."""
+"""Identity of a cause: name, joints, place, driver, subject, and if it begins or ends."""
 
 
 def identity(candidate: Candidate) -> Identity:

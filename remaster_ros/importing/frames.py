@@ -51,13 +51,13 @@ def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
     """Text table of a data frame; its index is the first column if `with_index`.
 
     Levels of column names are joined by a blank. A table whose columns are merely counted, as
-    those of an array, has no header; among named columns a counted one is called 'column 3'.
+    those of an array, has no header; a number among names becomes a name, such as 'column 3'.
     Rows without a value are left out, with a note.
     """
     header = [' '.join(map(str, c)) if isinstance(c, tuple) else str(c) for c in frame.columns]
-    named = not all(map(str.isdigit, header))
+    named = not all(map(_is_number, header))
     # A header with numbers would be read as a row of data.
-    header = [f'column {text}' if text.isdigit() else text for text in header]
+    header = [f'column {text}' if _is_number(text) else text for text in header]
     rows = [[_cell(value) for value in row] for row in frame.itertuples(index=False, name=None)]
     empty = [str(i) for i, row in enumerate(rows) if not any(row)]
     if with_index:
@@ -77,6 +77,15 @@ def _table_of(frame: Any, name: str, with_index: bool) -> TextTable:
         rows_in_order=0 if with_index else len(rows),
         notes=(*table.notes, *(note,) * bool(empty)),
     )
+
+
+def _is_number(label: str) -> bool:
+    """Whether the label of a column is a number, as Python writes it."""
+    try:
+        float(label)
+    except ValueError:
+        return False
+    return True
 
 
 def _cell(value: Any) -> str:

@@ -254,5 +254,5 @@ def _is_jaw(joint: UrdfJoint) -> bool:
 
 
 def _named(joints: list[UrdfJoint], names: Container[str]) -> int:
-    """Return how many of the joints `names` has."""
+    """Number of joints whose name is in `names`."""
     return sum(joint.name in names for joint in joints)

@@ -158,7 +158,7 @@ class CollisionModel:
         return self.describe(min(found, key=lambda short: short.distance - short.kept))
 
     def path_trouble(self, waypoints: ArrayLike, extra: float = 0.0) -> str:
-        """Return what blocks a path, as text; '' if it is free and within the joint limits.
+        """Obstruction of a path, as text; '' if it is free and within the joint limits.
 
         ``waypoints``: configurations, straight in joint space between each two, rad, (n, k),
         n >= 1; ``extra``: added to the clearance, m.

@@ -122,7 +122,7 @@ def in_steps(trajectory: Trajectory, horizon_s: float) -> Trajectory:
 
 
 def step_of(trajectory: Trajectory, index: int) -> Piece:
-    """Return one line of a trajectory as a piece, with times from the trajectory's start.
+    """Piece of a trajectory that is one of its lines, with times from the trajectory's start.
 
     ``index``: of the line, from 0; the piece of the last line is the last one.
     """

@@ -358,7 +358,7 @@ class Acknowledged:
         self._before = self._ask(ending)
 
     def _ask(self, ending: threading.Event) -> dict[str, int] | None:
-        """Return how many messages a recorder has taken, by topic.
+        """Number of messages that a recorder has taken, by topic.
 
         None without an answer in `TAKEN_S`, or if `ending` is set.
         """

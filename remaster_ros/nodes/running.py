@@ -67,7 +67,7 @@ class RemasterNode(Node):
         self._name_lock = NameLock(self.context.get_domain_id(), self.get_fully_qualified_name())
 
     def destroy_node(self) -> None:
-        """As in rclpy; another process may be this node from then on."""
+        """Destroy the node, and release the lock of its name for another process."""
         super().destroy_node()
         self._name_lock.release()
 
@@ -76,14 +76,14 @@ class RemasterNode(Node):
     # what the graph shows not to match (`status.mismatches`).
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
-        """As in rclpy, without default event handlers (which warn of QoS mismatches)."""
+        """Create a publisher as rclpy does, without its warnings of QoS mismatches."""
         kwargs.setdefault('event_callbacks', PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*args, **kwargs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., Any], *args: Any, **kwargs: Any
     ) -> Subscription:
-        """As in rclpy, without default event handlers (which warn of QoS mismatches).
+        """Subscribe as rclpy does, without its warnings of QoS mismatches.
 
         A message for which the callback raises InputError is dropped, with a line in the log
         (`on_unreadable`).

@@ -42,7 +42,7 @@ class SessionKeeper:
 
     @property
     def waits_for(self) -> str:
-        """What has to happen before the waiting write can succeed; '' if none waits."""
+        """Condition under which the waiting write can succeed, as text; '' if none waits."""
         return self.full if self._moved or not self.full else f'room on the disk: {self.full}'
 
     def write(self, write: Callable[[], object]) -> None:

@@ -201,7 +201,7 @@ def marker_rows(fit: Mapping[str, Any], session: Session) -> list[dict[str, Any]
 
 
 def motion_rows(fit: Fit) -> list[tuple[str, str]]:
-    """Return what a fit of a moving session states besides offsets: (quantity, value) as texts.
+    """Results of the fit of a moving session besides offsets: (quantity, value) as texts.
 
     How late the stamps of each sensor are, lag and wind-up of each joint, the frequency at
     which the tool swings, and the held-out errors in motion and at standstill. [] for a

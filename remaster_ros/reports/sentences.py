@@ -122,7 +122,7 @@ def look_alike_name(effect: FoundEffect, other: LookAlike) -> str:
 
 
 def coverage_words(held_out: Coverage, gross: int) -> str:
-    """Return how many held-out rows lie in their predicted 95 % regions, as text.
+    """Clause on the number of held-out rows that lie in their predicted 95 % regions.
 
     '' if there are none. ``gross``: number of held-out gross errors, which are not counted.
     """

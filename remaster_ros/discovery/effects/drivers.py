@@ -1,4 +1,4 @@
-"""What may drive an error: time, temperature, angles, torques and moves of joints."""
+"""Drivers of an error: time, temperature, angles, torques and moves of joints."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What has no name: places by drivers by forms, so that an unknown cause is still located."""
+"""Unnamed candidates by place, driver and form, so that an unknown cause is still located."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ FROZEN = 10
 
 
 class Sighting(NamedTuple):
-    """What a message says about the marker: time, frame, position and orientation."""
+    """Marker in a message: time, frame, position and orientation."""
 
     stamp_s: float  # Stamp of the header, s; 0 if the sending node has set none
     frame: str

@@ -138,7 +138,7 @@ def _reopen(folder: Path, *, keep_status: bool) -> str:
 
 
 def _intact_size(path: Path, data: bytes, wanted: bytes, last_rows: Sequence[str]) -> int:
-    """Return how many bytes at the begin of observations.csv are to be kept after a crash.
+    """Number of intact bytes at the begin of observations.csv after a crash, which are kept.
 
     ``data``: content of the file; ``wanted``: its content by the journal. All bytes if
     ``wanted`` begins with them; else the whole lines before the first byte that differs. That

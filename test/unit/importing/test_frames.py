@@ -51,16 +51,19 @@ def test_a_frame_is_the_table_in_a_file(arm, frame, tmp_path):
     np.testing.assert_array_equal(two.position, of_file.position)
 
 
-@pytest.mark.parametrize('columns', ['counted', 'counted on'])
+@pytest.mark.parametrize('columns', ['counted', 'counted on', 'other numbers'])
 @pytest.mark.parametrize('index', ['from 5', 'permuted', 'names'])
 def test_frames_of_arrays_have_no_row_more_than_the_arrays(columns, index, arm, frame, tmp_path):
     """Column labels that are numbers are no row of data, whatever the index is."""
     urdf, n = tmp_path / 'robot.urdf', len(arm.q)
     rows = np.arange(5, n) if index == 'from 5' else np.random.default_rng(2).permutation(n)
     labels = [f'P{i:02d}' for i in rows] if index == 'names' else [int(i) for i in rows]
-    first = 0 if columns == 'counted' else 3
+    first = {'counted': 0, 'counted on': 3, 'other numbers': -1.5}[columns]
     q, points = np.rad2deg(arm.q).round(4)[rows], (1e3 * arm.points).round(3)[rows]
-    frames = [frame(dict(enumerate(array.T, start=first)), index=labels) for array in (q, points)]
+    frames = [
+        frame({first + i: column for i, column in enumerate(array.T)}, index=labels)
+        for array in (q, points)
+    ]
     found = remaster_ros.session_from(*frames, urdf).measurements
     arrays = [array_frame(array, frame) for array in (q, points)]
     of_arrays = remaster_ros.session_from(*arrays, urdf)
