@@ -2,7 +2,8 @@
 """Proof of a fit of a moving arm by poses at standstill that it never fitted.
 
 What the arm does in motion, and the model of motion lacks, is taken up by the zero-offsets and
-seen at standstill: the error there is then larger than that of held-out motion, beyond chance.
+seen at standstill: the error there is then larger than that of held-out motion, beyond chance. So
+it is if the set-up was changed in between.
 """
 
 from __future__ import annotations
@@ -42,8 +43,10 @@ class MotionProof(Struct, frozen=True):
         return (
             f'{errors}. By chance it would be so much larger at standstill in '
             f'{100.0 * self.chance:.1g} '
-            '% of fits: the arm does something in motion that the model of the motion lacks, and '
-            'the offsets contain it. Measure with a lower speed_share, or by stop and go.'
+            '% of fits. Either the sensor, a marker or the arm was changed between the motion and '
+            'these poses (--proof takes a session of the same set-up), or the arm does something '
+            'in motion that the model of the motion lacks, and the offsets contain it: measure '
+            'with a lower speed_share, or by stop and go.'
         )
 
 
