@@ -32,6 +32,9 @@ SENSOR_MARKERS = 'os^Dv'
 FAINT = '#808a96'
 WIDTH_IN = 8.4
 SCATTER_POINTS = 1500
+# Decades up to which labels at 1, 2 and 5 have room: the narrowest axis has some 250 pt, 1 and 2
+# are 0.3 decades apart, and '0.002' with its gap takes 30 pt at 8 pt.
+FEW_DECADES = 2.5
 Drawn = TypeVar('Drawn')
 
 STYLE: Any = {
@@ -168,10 +171,20 @@ def legend_entry(marker: str, color: str, name: str) -> Line2D:
     )
 
 
+class _PlainLogLocator(LogLocator):
+    """Ticks at 1, 2 and 5 of each decade; of many decades (`FEW_DECADES`) at 1 alone."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
+        """Tick positions for the limits of an axis."""
+        few = vmin > 0.0 and vmax <= vmin * 10.0**FEW_DECADES
+        self.set_params(subs=(1.0, 2.0, 5.0) if few else (1.0,))
+        return super().tick_values(vmin, vmax)
+
+
 def log_axis(ax: Axes, which: str) -> None:
-    """Make an axis ('y', else x) logarithmic, labelled in plain numbers at 1, 2 and 5."""
+    """Make an axis ('y', else x) logarithmic, labelled in plain numbers (`_PlainLogLocator`)."""
     axis = ax.yaxis if which == 'y' else ax.xaxis
     (ax.set_yscale if which == 'y' else ax.set_xscale)('log')
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_locator(_PlainLogLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f'{value:g}'))
     axis.set_minor_formatter(NullFormatter())
