@@ -10,6 +10,7 @@ from pathlib import Path
 
 from remaster_ros.calibration.mistakes import sound_estimate
 from remaster_ros.errors import InputError, InsufficientDataError, MistakeFoundError
+from remaster_ros.session.records.plan_journal import refuse_unimported
 from remaster_ros.session.records.reader import ROWS, read_session
 from remaster_ros.session.records.together import disagreements, together
 from remaster_ros.types import Session
@@ -23,9 +24,12 @@ def read_together(folders: Sequence[Path]) -> tuple[Session, list[str]]:
     The lines say what is renamed, and which sessions cannot be compared; [] for one session.
     Disagreements between sessions are logged as warnings, and kept in the session. Raises
     InputError if a session cannot be read, or zero-offsets show that arms differ;
+    InsufficientDataError if the rows to fit are still in the recording of a motion;
     MistakeFoundError as `read_to_fit`.
     """
     sessions = [(str(folder), read_to_fit(folder)) for folder in folders]
+    for name, session in sessions:
+        refuse_unimported(session, name)
     if len(sessions) == 1:
         return sessions[0][1], []
     session, lines = together(sessions)

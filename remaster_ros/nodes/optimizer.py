@@ -44,6 +44,7 @@ from remaster_ros.reports.fit_json import DISCOVERY_FILE, FIT_FILE, read_fit
 from remaster_ros.reports.loadable import uncertainty
 from remaster_ros.reports.result_folder import prepare_folder, save_fit
 from remaster_ros.session.cells.workcell import read_cell
+from remaster_ros.session.records.plan_journal import refuse_unimported
 from remaster_ros.session.records.priors_file import read_priors
 from remaster_ros.session.records.reader import read_session
 from remaster_ros.types import FloatArray, Priors
@@ -147,6 +148,7 @@ class Optimizer(RemasterNode):
         """
         out = Path(self.p.out)
         session = read_session(self.p.session)
+        refuse_unimported(session, self.p.session)
         prepare_folder(out, FIT_FILE)
         result = fit_session(
             session,
@@ -187,6 +189,7 @@ class Optimizer(RemasterNode):
 
         out = Path(self.p.discovery)
         session = read_session(self.p.session)
+        refuse_unimported(session, self.p.session)
         prepare_folder(out, DISCOVERY_FILE)
         # Of the same session before more was measured: what was left open then?
         pairs: Sequence[tuple[Any, Any]] = ()

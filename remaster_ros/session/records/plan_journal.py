@@ -8,6 +8,7 @@ the tour. Outcomes of configurations are in the session's journal alone.
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections import Counter, deque
 from collections.abc import Mapping
@@ -16,9 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 
+from remaster_ros.calibration.estimate import FEWEST_POSES
 from remaster_ros.collection.events import Decided
-from remaster_ros.errors import DiskError, InputError
+from remaster_ros.errors import DiskError, InputError, InsufficientDataError
 from remaster_ros.kinematics.collision import CollisionModel
 from remaster_ros.kinematics.serial_chain import SerialChain
 from remaster_ros.planning.candidates import Plan
@@ -29,6 +32,7 @@ from remaster_ros.session.records.journal import Journal, Record, read_journal
 from remaster_ros.session.records.reader import PLAN
 from remaster_ros.session.records.session_journal import read_outcomes
 from remaster_ros.session.yaml_records import from_plain, to_plain
+from remaster_ros.types import Session
 
 Configuration = tuple[str, int, int]
 """Split, pose and solution, as in the plan."""
@@ -191,6 +195,34 @@ def read_plan(folder: Path, chain: SerialChain) -> RecordedPlan | None:
             f'{path}: no plan of this version ({type(error).__name__}: {error}); '
             'move it out of the session folder to go without'
         ) from None
+
+
+def refuse_unimported(session: Session, folder: str | os.PathLike[str]) -> None:
+    """Raise InsufficientDataError if the rows to fit are still in the recording of the motion.
+
+    They are if the arm of the session's plan is measured while it moves along curves, and the
+    session itself has too few poses to fit. ``folder``: of the session.
+    """
+    fitted = session.measurements.pose[~session.measurements.is_validation]
+    if session.is_moving or len(np.unique(fitted)) >= FEWEST_POSES:
+        return
+    folder = Path(folder)
+    chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
+    try:
+        plan = read_plan(folder, chain)
+    except InputError:
+        return
+    if plan is None or all(
+        pose.way is None for part in plan.tour.plans.values() for pose in part.poses
+    ):
+        return
+    recording = f'{folder / "bag"}' if (folder / 'bag').is_dir() else 'BAG (its bag is not there)'
+    raise InsufficientDataError(
+        f'{folder}: by its plan the arm is measured while it moves, so that the rows to fit are '
+        f'in the recording of the motion. Import them: remaster import --moving {recording} '
+        f'--cell CELL --proof {folder} --out NEW (CELL is the cell file of the collection), then '
+        'use NEW as the session'
+    )
 
 
 class PlanJournal:

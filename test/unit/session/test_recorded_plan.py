@@ -5,14 +5,17 @@ import json
 
 import numpy as np
 import pytest
+from rigs.command_line import refusal
 
+import remaster_ros
 from remaster_ros.errors import InputError
-from remaster_ros.planning.candidates import Plan, PlannedPose
+from remaster_ros.planning.candidates import CurvedWay, Plan, PlannedPose
 from remaster_ros.planning.collection_plan import Expected
 from remaster_ros.planning.tour_order import FITTED, REFERENCE, REGISTRATION, Tour
 from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.records.journal import Journal
 from remaster_ros.session.records.plan_journal import PlanJournal, plan_page_path, read_plan
+from remaster_ros.session.records.reader import write_session
 
 CHAIN = read_cell('demo').chain()
 JOINTS = len(CHAIN)
@@ -116,3 +119,24 @@ def test_what_is_no_plan_is_refused_in_one_line(tmp_path, change):
         read_plan(tmp_path / 's', CHAIN)
     assert '\n' not in str(found.value)
     assert str(path) in str(found.value)
+
+
+@pytest.mark.parametrize('verb', ['fit', 'discover'])
+@pytest.mark.parametrize('moves', [True, False])
+def test_a_session_whose_motion_is_not_imported_names_the_import(tmp_path, verb, moves):
+    """Of an arm that is measured while it moves the session itself holds one pose to fit."""
+    session = remaster_ros.simulate(poses=5, validation_poses=3, seed=1).session
+    rows = session.measurements
+    folder = tmp_path / 's'
+    write_session(folder, session.select(rows.is_validation | (rows.pose == rows.pose[0])))
+    q = np.random.default_rng(1).uniform(-1.5, 1.5, (3, JOINTS))
+    way = CurvedWay(q, np.array([0.0, 0.3, 0.6])) if moves else None
+    on_the_way = PlannedPose(CHAIN.forward(q[2]), q[2:], way=way)
+    journal = PlanJournal(folder, {}, CHAIN)
+    journal.begin(Tour(CHAIN, {FITTED: plan_of(2, 1, 1), 'validation': Plan((on_the_way,))}))
+    journal.close()
+    (folder / 'bag').mkdir()
+    told = refusal(verb, folder, '--out', tmp_path / 'out', status=1)
+    command = f'remaster import --moving {folder}/bag --cell CELL --proof {folder} --out NEW'
+    assert (command in told) == moves
+    assert ('saw 1 pose to fit' in told) != moves
