@@ -67,7 +67,7 @@ class Relay:
 
 
 ROOT = Path(__file__).parents[2]
-SEED, RATE, SPEED_SHARE = 11, 4.0, 0.2
+SEED, SPEED_SHARE = 11, 0.2
 SENSOR_OF = {'optitrack_markers': 'mocap', 'laser_tracker_markers': 'tracker'}
 NODES = ('pose_planner', 'robot_bridge', 'recorder', *SENSOR_OF)
 FAKES = ('fake_robot', 'fake_optitrack', 'fake_laser_tracker')
@@ -115,15 +115,18 @@ class Bench:
         Of the planner; 0 for a collection without references.
     several_markers
         Whether the bar measures three markers, and the tracker two reflectors.
+    rate
+        World time over wall time. Above 1 the world waits for the bridge and the recorder; at 1 it
+        waits for neither, as no real arm does.
     """
 
     def __init__(
         self, folder: Path, domain: int, *, relays=False, emergency=False, require='all',
-        candidates=32, reference_every=0, several_markers=False,
+        candidates=32, reference_every=0, several_markers=False, rate=4.0,
     ) -> None:  # fmt: skip
-        self.folder, self.session = folder, folder / 'session'
+        self.folder, self.session, self.rate = folder, folder / 'session', rate
         self._cell = str(cell_of_several_markers(folder)) if several_markers else 'demo'
-        self.world = make_world(folder / 'world', read_cell(self._cell), SEED, RATE)
+        self.world = make_world(folder / 'world', read_cell(self._cell), SEED, rate)
         (folder / 'log').mkdir()
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get('PYTHONPATH'))))
         self._environment = {
@@ -157,6 +160,9 @@ class Bench:
             'optitrack_markers': ports,
             'laser_tracker_markers': {'port': tracker},
         }  # fmt: skip
+        if rate == 1.0:
+            for name in ('robot_bridge', 'recorder'):
+                self._values[name]['simulated_clock_rate'] = 0.0
         self.processes: dict[str, subprocess.Popen] = {}
         self._callers: dict[str, object] = {}
         self.relays: dict[str, Relay] = {}
@@ -299,15 +305,18 @@ class Bench:
         self.until(registered, 120, 'a registration')
 
     def under_way(self) -> None:
-        """Wait until the arm has gone a third of a long move."""
+        """Wait until the arm is on its way, and goes on for more than half a second."""
         began = time.monotonic()
 
         def on_its_way() -> bool:
             moves = [c for c in self.observer.since(began) if c.is_move]
-            if not moves or moves[-1].duration_s < 0.9 * RATE:
+            if not moves:
                 return False
-            gone_s = (time.monotonic() - moves[-1].wall_s) * RATE
-            return gone_s > 0.3 * moves[-1].duration_s
+            # A long move comes in pieces, of the same stamp.
+            first_s = next(c.wall_s for c in moves if c.stamp_s == moves[-1].stamp_s)
+            now = time.monotonic()
+            left_s = self.observer.left_s(moves[-1]) - (now - moves[-1].wall_s) * self.rate
+            return (now - first_s) * self.rate > 1.0 and left_s > 0.6 * self.rate
 
         self.until(on_its_way, 60, 'a long move')
 

@@ -2,12 +2,14 @@
 """What a bench of real nodes observes: every command to the controller, and the messages about it.
 
 Commands are judged as a controller takes them: cubics from where the arm is to the first point,
-and from point to point. Where the arm is comes from the hidden World, which notes when each
-trajectory began, and not from joint_states, which the fault under test may have spoiled.
+and from point to point; of a trajectory whose stamp has passed, what remains of it. Where the arm
+is comes from the hidden World, which notes when each trajectory began, and not from joint_states,
+which the fault under test may have spoiled.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 import time
@@ -25,7 +27,7 @@ from remaster_ros.collection.events import (
     SolutionFailed,
 )
 from remaster_ros.session.yaml_records import from_plain
-from remaster_ros.simulation.arm_motion import Motion, ServoPoint, spline
+from remaster_ros.simulation.arm_motion import Motion, ServoPoint, from_now, spline
 from remaster_ros.simulation.world import MOTION_FILE, START_S
 
 TOUCHED_RAD = 1e-4
@@ -52,23 +54,24 @@ class Command:
     ----------
     wall_s
         When, s.
+    stamp_s
+        Its stamp, world time, s, which all pieces of a move share; 0 for at once.
+    points
+        Points of the message, also those that have passed: a stop and a probe have one.
     times_s, q, velocity
-        Of its points, the first being the arm at that moment: (n,), rad (n, k), rad/s (n, k).
+        Where the controller begins, and the points that remain: (n,), rad (n, k), rad/s (n, k).
     """
 
     wall_s: float
+    stamp_s: float
+    points: int
     times_s: np.ndarray
     q: np.ndarray
     velocity: np.ndarray
 
     @property
-    def points(self) -> int:
-        """Points of the message: a stop has one."""
-        return len(self.times_s) - 1
-
-    @property
     def duration_s(self) -> float:
-        """Robot time, s."""
+        """Robot time from its arrival to its end, s."""
         return float(self.times_s[-1])
 
     @property
@@ -78,12 +81,12 @@ class Command:
 
     @property
     def is_move(self) -> bool:
-        """Whether it is a way to somewhere: no stop, and no probe."""
+        """Whether it is a move, or a piece of one: no stop, and no probe."""
         return self.points > 1 and self.travel_rad > TOUCHED_RAD
 
     def extremes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return lowest and highest position and highest speed of the cubics, each (k,)."""
-        places, speeds = [], []
+        places, speeds = [self.q[:1]], [np.zeros_like(self.q[:1])]
         for (t0, q0, v0), (t1, q1, v1) in pairwise(zip(self.times_s, self.q, self.velocity)):
             c = spline(q0, v0, q1, v1, t1 - t0)
             s = np.linspace(0.0, t1 - t0, 41)
@@ -91,6 +94,28 @@ class Command:
             speeds.append(np.abs(s[:, None] ** np.arange(3) @ (c[1:] * np.arange(1, 4)[:, None])))
         q = np.concatenate(places)
         return q.min(0), q.max(0), np.concatenate(speeds).max(0)
+
+
+@dataclass(frozen=True)
+class TakenUp:
+    """A trajectory that the arm has taken up.
+
+    Attributes
+    ----------
+    start_s
+        When, world time, s.
+    waypoints
+        What remained of it then, at times from `start_s`.
+    before
+        Position and velocity of the arm then, rad, rad/s, (k,) each.
+    after
+        The motion with it.
+    """
+
+    start_s: float
+    waypoints: list[ServoPoint]
+    before: tuple[np.ndarray, np.ndarray]
+    after: Motion
 
 
 class Observer:
@@ -109,12 +134,14 @@ class Observer:
     def __init__(self, node, world, speed_share: float) -> None:
         from trajectory_msgs.msg import JointTrajectory
 
-        from remaster_ros.nodes.robot_bridge import COMMANDS
+        from remaster_ros.nodes.robot_bridge import COMMANDS, SOLUTIONS
         from remaster_ros.nodes.status import RELIABLE, listen
 
         self.world, self.chain, self.speed_share = world, world.chain, speed_share
         self._messages: list = []
         self._commands: list[Command] = []
+        still = Motion(START_S, world.start_q)
+        self._motions, self._read_to = [TakenUp(START_S, [], still.at(START_S), still)], 0
         self.events: list[tuple[float, Event]] = []
         self.summaries: list[tuple[float, str, str, dict[str, str]]] = []
         self.latest: dict[str, tuple[float, str, dict[str, str]]] = {}
@@ -125,6 +152,26 @@ class Observer:
             lambda message: self._messages.append((time.monotonic(), world.now(), message)),
             RELIABLE,
         )
+        self._targets = np.zeros((0, len(self.chain)))
+        node.create_subscription(JointTrajectory, SOLUTIONS, self._announced, RELIABLE)
+
+    def _announced(self, message) -> None:
+        columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
+        self._targets = np.array([np.array(point.positions)[columns] for point in message.points])
+
+    def left_s(self, command: Command) -> float:
+        """Return the least robot time from a command's arrival to the end of its move, s.
+
+        Of the solutions announced last the move is to the one that lies in its direction; no
+        joint is faster than the bridge lets it be.
+        """
+        way, ways = command.q[-1] - command.q[0], self._targets - command.q[0]
+        lengths = np.linalg.norm(way) * np.linalg.norm(ways, axis=1)
+        if not np.any(lengths > 0.0):
+            return 0.0
+        along = np.where(lengths > 0.0, ways @ way / np.maximum(lengths, 1e-12), -1.0)
+        fastest = self.speed_share * self.chain.velocity_limits
+        return float(np.max(np.abs(ways[np.argmax(along)]) / fastest))
 
     def _record(self, record) -> None:
         if not isinstance(record.body, STATES):
@@ -142,35 +189,64 @@ class Observer:
             self._commands.append(self._command(*self._messages[len(self._commands)]))
         return self._commands
 
-    def _start(self, came_s: float, points: int, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return where the arm was, and how fast, when a command to `end` began.
+    def _read_motions(self) -> None:
+        """Follow the trajectories that the arm has taken up since the last call."""
+        with (self.world.folder / MOTION_FILE).open() as file:
+            file.seek(self._read_to)
+            while (line := file.readline()).endswith('\n'):
+                self._read_to = file.tell()
+                start_s, plain, now = json.loads(line)
+                waypoints = from_plain(plain, list[ServoPoint])
+                reference = None if now is None else (np.array(now[0]), np.array(now[1]))
+                motion = copy.copy(self._motions[-1].after)
+                before = motion.at(start_s)
+                motion.follow(start_s, waypoints, reference)
+                self._motions.append(TakenUp(start_s, waypoints, before, motion))
+
+    def _begun(
+        self, came_s: float, stamp_s: float, points: list[ServoPoint]
+    ) -> tuple[float, tuple[np.ndarray, np.ndarray]]:
+        """Return when the arm took a command up, world time, s; its place and speed then.
 
         It came here at world time `came_s`, which may stand between two readings of a wall clock.
+        One that the arm has dropped was taken up when it came.
         """
-        while (text := (self.world.folder / MOTION_FILE).read_text())[-1:] not in ('', '\n'):
-            time.sleep(0.01)  # The arm is writing the last line.
-        lines = text.splitlines()
-        motion = Motion(START_S, self.world.start_q)
+        self._read_motions()
         nearest_s, begun = SAME_WALL_S * self.world.rate, None
-        for start_s, plain in map(json.loads, lines):
-            waypoints = from_plain(plain, list[ServoPoint])
-            since_s, off = abs(start_s - came_s), np.max(np.abs(waypoints[-1].q - end))
-            if len(waypoints) == points and off < SAME_RAD and since_s < nearest_s:
-                nearest_s, begun = since_s, motion.at(start_s)
-            motion.follow(start_s, waypoints)
-        # One that the arm has dropped began when it came.
-        return begun or motion.at(came_s)
+        last = self._motions[0]
+        for motion in self._motions[1:]:
+            if motion.start_s <= came_s:
+                last = motion
+            remaining, _ = from_now(motion.start_s, stamp_s or None, points)
+            since_s = abs(motion.start_s - came_s)
+            off = np.max(np.abs(motion.waypoints[-1].q - points[-1].q))
+            is_same = len(motion.waypoints) == len(remaining) and off < SAME_RAD
+            if is_same and since_s < nearest_s:
+                nearest_s, begun = since_s, (motion.start_s, motion.before)
+        return begun or (came_s, last.after.at(came_s))
 
     def _command(self, wall_s: float, came_s: float, message) -> Command:
         columns = [list(message.joint_names).index(name) for name in self.chain.joint_names]
-        end = np.array(message.points[-1].positions)[columns]
-        q, velocity = self._start(came_s, len(message.points), end)
-        times, places, speeds = [0.0], [q], [velocity]
-        for point in message.points:
-            times.append(point.time_from_start.sec + 1e-9 * point.time_from_start.nanosec)
-            places.append(np.array(point.positions)[columns])
-            speeds.append(np.array(point.velocities)[columns])
-        return Command(wall_s, *map(np.array, (times, places, speeds)))
+        stamp_s = _seconds(message.header.stamp)
+        points = [
+            ServoPoint(
+                _seconds(point.time_from_start),
+                np.array(point.positions)[columns],
+                np.array(point.velocities)[columns],
+            )
+            for point in message.points
+        ]
+        begun_s, start = self._begun(came_s, stamp_s, points)
+        remaining, reference = from_now(begun_s, stamp_s or None, points)
+        q, velocity = reference or start
+        return Command(
+            wall_s,
+            stamp_s,
+            len(points),
+            np.array([0.0, *(point.time_s for point in remaining)]),
+            np.array([q, *(point.q for point in remaining)]),
+            np.array([velocity, *(point.velocity for point in remaining)]),
+        )
 
     # What was commanded
 
@@ -234,6 +310,11 @@ class Observer:
                 del found[text]
         wanted = {plain(text): rank for text, rank in found.items() if not _follows(text)}
         return sorted(wanted, key=lambda text: (wanted[text], text))
+
+
+def _seconds(stamp) -> float:
+    """Return a Time or Duration message in s."""
+    return stamp.sec + 1e-9 * stamp.nanosec
 
 
 def _follows(text: str) -> bool:

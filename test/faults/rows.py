@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from faults.bench import RATE, SENSOR_OF, Bench
+from faults.bench import SENSOR_OF, Bench
 from faults.observation import Row, wait_until
 
 from remaster_ros.collection.events import VERSION, SolutionSettled
@@ -258,7 +258,7 @@ FIVE = (
         Row(
             'robot',
             f'joint_states come {late:g} s late, then a pause',
-            then_pause(robot(late=late * RATE)),
+            then_pause(robot(late=late)),
             lasts_s=2.5,
             times=True,
         )
@@ -299,7 +299,7 @@ ROBOT = (
     Row('robot', 'drifts while settling', robot(drift=1e-3), lasts_s=22.0),
     Row('robot', 'stops publishing', robot(off=1), lasts_s=6.0, times=True),
     Row('robot', 'switched off and on', robot(off=1), robot(reordered=1), lasts_s=6.0, times=True),
-    Row('robot', 'publishes every other 4 s', robot(intermittent=4.0 * RATE), lasts_s=9.0,
+    Row('robot', 'publishes every other 4 s', robot(intermittent=4.0), lasts_s=9.0,
         times=True),
     Row('robot', 'publishes what was commanded as measured', robot(copy=1), lasts_s=8.0),
     Row('robot', 'reports NaN', robot(nan=1)),
@@ -307,8 +307,8 @@ ROBOT = (
     Row('robot', 'joints in another order each time', robot(reordered=1)),
     Row('robot', 'clock jumps an hour ahead', robot(clock=3600.0), times=True),
     Row('robot', 'clock jumps an hour back', robot(clock=-3600.0), times=True),
-    Row('robot', 'joint_states come 1 s late', robot(late=RATE), times=True),
-    Row('robot', 'joint_states stamped 1 s early', robot(clock=RATE), times=True),
+    Row('robot', 'joint_states come 1 s late', robot(late=1.0), times=True),
+    Row('robot', 'joint_states stamped 1 s early', robot(clock=1.0), times=True),
     Row('robot', 'two of three joint_states lost', robot(lost=3)),
     Row('robot', 'each of joint_states doubled', robot(doubled=1)),
     Row('robot', 'the same joint_states again and again', robot(repeated=1), times=True),

@@ -17,7 +17,7 @@ from rigs.ros_rig import ROOT, domains
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow, pytest.mark.timeout(900)]
 
-TRIED = sorted(rows.ROWS, key=lambda row: list(observation.BENCHES).index(row.bench))
+TRIED = sorted(rows.ROWS, key=lambda row: list(observation.BENCHES).index(row.kind))
 TRIES = 3
 ENOUGH = 12
 """So many configurations must be left for another row."""
@@ -122,7 +122,7 @@ def test_row(benches, row):
     Which of several reasons comes first depends on the moment and on how busy the machine is.
     """
     for tried in range(1, TRIES + 1):
-        bench = benches.of(row.bench)
+        bench = benches.of(row.kind)
         benches.broken = True
         try:
             seen = observation.observe(bench, row)
