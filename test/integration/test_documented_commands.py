@@ -28,9 +28,12 @@ from judges.documented_commands import (
     small,
 )
 from judges.documented_commands import PAGES as ALL
-from worlds.simple_cells import four_markers
+from worlds.moving_bags import CELL, held_out_standing, names_of, recorded, write_bag
+from worlds.moving_world import MovingWorld, Recording
+from worlds.simple_cells import four_markers, write_cell
 
 from remaster_ros.cli.main import VERBS, main
+from remaster_ros.session.records.reader import write_session
 
 # Together a few seconds; the others are run by `make qualify`.
 CHEAP = {
@@ -124,7 +127,12 @@ def supply(word: str, readers_files: Path, here: Path) -> None:
     name, target = Path(word).parts[0], here / Path(word).parts[0]
     if target.exists() or word.startswith('-'):
         return
-    if (readers_files / name).exists():
+    if word == 'session/bag':
+        moving_session(Path(name))
+    elif name == 'my_bag':
+        write_bag(target, *recording_with_stops())
+        Path('arm.urdf').write_text(CELL.urdf_text, encoding='utf-8')
+    elif (readers_files / name).exists():
         shutil.copy(readers_files / name, target)
     elif name in ('my_session', 'session', 'other_session', 's1', 's2', 'saggy'):
         # A cause so small that it has look-alikes, which `plan --separate` needs.
@@ -155,6 +163,28 @@ def supply(word: str, readers_files: Path, here: Path) -> None:
     elif name == 'my_cell.yaml':
         cell = (ROOT / 'config/cells/demo.yaml').read_text('utf-8')
         Path(name).write_text(cell.replace('../robots', str(ROOT / 'config/robots')), 'utf-8')
+
+
+def recording_with_stops() -> tuple[MovingWorld, Recording]:
+    """Return the recording of an arm that moves and stands in turn, and its world."""
+    return recorded(5003, seconds=7.0, stops=True, joints_hz=125.0, camera_hz=60.0)
+
+
+def moving_session(folder: Path) -> None:
+    """Write a session of standstills with the bag of the motion between them, and its cell."""
+    world, recording = recording_with_stops()
+    write_session(folder, held_out_standing(world, recording))
+    first, *further = names = names_of(world)
+    bar = {
+        'marker': first,
+        'further_markers': {name: number for number, name in enumerate(further, 2)},
+        'topic': 'bar/marker',
+        'rough_position_m': [1.9, 0.0, 1.3],
+    }
+    markers = {name: place.tolist() for name, place in zip(names, world.nominal, strict=True)}
+    write_cell(Path('my_cell.yaml'), markers=markers, sensors={'bar': bar}, aim_at='bar')
+    topics = {f: f'/bar/marker/{f}' for f in further} | {first: '/bar/marker'}
+    write_bag(folder / 'bag', world, recording, topics=topics)
 
 
 def without_numbers(line: str) -> str:

@@ -44,7 +44,9 @@ class Command(NamedTuple):
     @property
     def is_run(self) -> bool:
         """Whether it can be run here: without ROS, on files that are not the reader's own."""
-        is_private = any(w.startswith(('~', '/')) or w in ('…', 'my_bag') for w in self.words)
+        # A bag of standstills costs a page more than all else on it; bags are tried elsewhere.
+        names_bag = 'my_bag' in self.words and '--moving' not in self.words
+        is_private = names_bag or any(w.startswith(('~', '/')) or w == '…' for w in self.words)
         return self.verb in {*VERBS} - NOT_RUN and not is_private
 
 

@@ -111,7 +111,7 @@ class Cell:
         def begin(name):
             if name == 'action_adapter':
                 sim_time = node_arguments(use_sim_time=True)
-                return start('action_adapter', *sim_time, cwd=ROOT / 'test')
+                return start('rigs.action_adapter', *sim_time, cwd=ROOT / 'test')
             if name.startswith('vendor_'):
                 sensor = name.removeprefix('vendor_')
                 where = folder / 'world', sensor, *foreign[sensor]

@@ -66,7 +66,7 @@ def test_a_demo_finds_what_is_hidden_and_opens_the_truth_at_the_end(ros_environm
     process = subprocess.run(
         [
             sys.executable, '-m', 'remaster_ros.cli.main', 'demo', '--out', str(out),
-            '--seed', '5', '--candidates', '14', '--no-figures', '--rate', '20',
+            '--seed', '5', '--candidates', '14', '--no-figures',
             '--hide', 'joint_compliance@2:1.0',
         ],
         env={**ros_environment, 'COLUMNS': '200'},

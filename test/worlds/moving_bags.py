@@ -147,8 +147,21 @@ def _header(t):
     return _ros('std_msgs/msg/Header', stamp=stamp, frame_id='')
 
 
-def write_bag(folder, world: MovingWorld, recording: Recording, kind: str = 'point') -> None:
-    """Write a recording as a bag: points, each marker with a topic, or poses."""
+def held_out_standing(world: MovingWorld, recording: Recording) -> Session:
+    """Return the session of the standstills of a recording, none of them to fit."""
+    still = standing(world, recording)
+    held_out = np.ones(len(still.measurements), bool)
+    return replace(still, measurements=replace(still.measurements, is_validation=held_out))
+
+
+def write_bag(
+    folder, world: MovingWorld, recording: Recording, kind: str = 'point', topics=None
+) -> None:
+    """Write a recording as a bag: points, each marker with a topic, or poses.
+
+    ``topics``: by the marker, for points; ``/bar/NAME`` unless given.
+    """
+    topics = topics or {name: f'/bar/{name}' for name in names_of(world)}
     messages = []
     empty = np.zeros(0)
     for t, q in zip(recording.joint_stamps, recording.joints, strict=True):
@@ -162,7 +175,7 @@ def write_bag(folder, world: MovingWorld, recording: Recording, kind: str = 'poi
             point = _ros('geometry_msgs/msg/Point', **dict(zip('xyz', place.tolist())))
             if kind == 'point':
                 message = _ros('geometry_msgs/msg/PointStamped', header=_header(t), point=point)
-                messages.append((t, f'/bar/{name}', 'geometry_msgs/msg/PointStamped', message))
+                messages.append((t, topics[name], 'geometry_msgs/msg/PointStamped', message))
                 continue
             turn = _ros('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
             pose = _ros('geometry_msgs/msg/Pose', position=point, orientation=turn)

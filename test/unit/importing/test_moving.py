@@ -7,7 +7,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from worlds.moving_bags import CELL, CHAIN, imported, recorded, standing, write_bag
+from worlds.moving_bags import (
+    CELL,
+    CHAIN,
+    held_out_standing,
+    imported,
+    recorded,
+    standing,
+    write_bag,
+)
 from worlds.moving_world import Dynamics, Errors, without_dynamics
 
 from remaster_ros.calibration.dynamics import TRAVELS_RAD, clocks_of, estimate_moving
@@ -297,10 +305,7 @@ def stopped():
     """Return a recording with standstills, its rows of motion, and the standstills, held out."""
     print('moving world, seed 5003')
     recording = recorded(5003, seconds=7.0, stops=True, joints_hz=125.0, camera_hz=60.0)
-    still = standing(*recording)
-    held_out = np.ones(len(still.measurements), bool)
-    still = replace(still, measurements=replace(still.measurements, is_validation=held_out))
-    return recording, imported(*recording)[0], still
+    return recording, imported(*recording)[0], held_out_standing(*recording)
 
 
 def joints_of(recording):
