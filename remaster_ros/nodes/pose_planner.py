@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import TransformStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.subscription import Subscription
@@ -339,14 +340,20 @@ class PosePlanner(RemasterNode):
         """Set the arm's configuration from the bridge's report that the arm has settled, rad or m.
 
         If the bridge corrects, these are the joint positions wanted, before the correction. An
-        invalid message changes nothing but `run.why`, which says what is wrong.
+        invalid message, also one with a position that is no finite number, changes nothing but
+        `run.why`, which says what is wrong.
         """
         try:
             # The nominal joint angles of the tool's pose, if the bridge corrects.
             wanted = wanted_of(message, self._order.names)
-            self._q = self._order.positions(message) if wanted is None else wanted
+            q = self._order.positions(message) if wanted is None else wanted
         except InputError as error:
             self.run.why = str(error)
+            return
+        if np.all(np.isfinite(q)):
+            self._q = q
+        else:
+            self.run.why = 'a reported joint position is no finite number'
 
     def _on_registration(self, message: TransformStamped) -> None:
         """Keep a sensor's registration, T_R_N (4, 4). Raises InputError as `transform_array`."""

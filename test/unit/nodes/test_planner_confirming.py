@@ -10,6 +10,7 @@ from rigs.ros_rig import OWN_DOMAIN
 pytest.importorskip('rclpy', reason='needs ROS 2 Jazzy or its wheels')
 
 import rclpy
+from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from worlds.simple_cells import write_cell
 
@@ -129,6 +130,22 @@ def test_a_pose_that_a_busy_recorder_has_not_taken_is_repeated_and_not_announced
     planner.peer(RecorderState(waiting_for='', run=''), started='second')
     planner.step_until(lambda: len(planner.announced) == 2, 'the pose again')
     assert planner.announced[1].pose == planner.announced[0].pose
+
+
+def test_a_reported_position_that_is_no_number_does_not_keep_the_planner_from_planning(begin):
+    planner = begin(confirm=False)
+    node = planner.node
+    planner.peer(RecorderState(waiting_for='', run=''))
+    planner.peer(BridgeState(halted=''))
+    assert planner.call('collect')[0]
+    planner.step_until(lambda: planner.announced, 'the first pose')
+    for wrong in (np.nan, np.inf):
+        settled = JointState(name=list(node._order.names), position=[wrong, *START[1:]])
+        node._on_settled(settled)
+        assert 'is no finite number' in node.run.why
+        planner.done()
+        count = len(planner.announced)
+        planner.step_until(lambda count=count: len(planner.announced) > count, 'the next pose')
 
 
 def test_a_pose_is_announced_only_where_its_own_plan_was_confirmed(begin, tmp_path):
