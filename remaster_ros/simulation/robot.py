@@ -110,7 +110,7 @@ class FakeArm:
                     return 'a position or velocity is not finite'
         if points[-1].velocity is not None and np.any(points[-1].velocity != 0.0):
             return 'velocity of the last point is not zero'
-        if start_s > 0.0 and start_s + times[-1] <= now:
+        if start_s and start_s + times[-1] <= now:
             return 'the trajectory ends in the past'
         return None
 
