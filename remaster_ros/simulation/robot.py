@@ -78,8 +78,13 @@ class FakeArm:
             for point in points
         ]
         begin = start_s or now
+        remaining, reference = from_now(now, begin, waypoints)
+        # Far from now, world time in a float does not tell points apart that nanoseconds do.
+        times = [0.0, *(point.time_s for point in remaining)]
+        if any(later <= earlier for earlier, later in pairwise(times)):
+            return 'its points are too close in time for a stamp so far from now'
         self._commanded = begin + waypoints[-1].time_s, points[-1].q[columns]
-        self.world.begin_motion(now, *from_now(now, begin, waypoints))
+        self.world.begin_motion(now, remaining, reference)
         return None
 
     def _refuse(

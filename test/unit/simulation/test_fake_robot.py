@@ -92,6 +92,8 @@ def test_times_must_increase_and_not_end_in_the_past(arm):
     assert 'increase' in arm.command(arm.names, points)
     for start_s in (50.0, -50.0):
         assert 'past' in arm.command(arm.names, points[:1], start_s=start_s)
+    close = [ServoPoint(1.0, np.zeros(7)), ServoPoint(1.0 + 1e-9, np.full(7, 0.1))]
+    assert 'too close' in arm.command(arm.names, close, start_s=2e9)
 
 
 def test_an_empty_trajectory_is_no_way_to_stop_it(world, arm):
