@@ -176,7 +176,15 @@ class Demo:
         self._wait(self._ready, ANSWER_WALL_S, 'the nodes to come up')
         self._trigger('remaster/collect', 'pose_planner')
         complete = self._collect()
-        results = self._estimate()
+        try:
+            results = self._estimate()
+        except DeviceError as error:
+            if complete:
+                raise
+            raise DeviceError(
+                f'the arm was halted before enough was measured for a fit ({error}): '
+                f'remaster demo --out {self.out} goes on'
+            ) from None
         times, file = self.node.times, None
         if self.p.apply and complete:
             file = self._apply()

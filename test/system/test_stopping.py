@@ -117,9 +117,12 @@ def test_a_halted_demo_ends_and_says_why(start, tmp_path):
     ]
     os.kill(robot, signal.SIGSTOP)
     process.wait(timeout=120)
-    assert process.returncode == 2, process.communicate()
-    error = process.stderr.read()
-    assert 'the arm was halted, which only a person ends' in error
+    printed, error = process.stdout.read(), process.stderr.read()
+    # 1 where it was measured for long enough to be fitted.
+    assert process.returncode in (1, 2), (printed, error)
+    told = ' '.join((error if process.returncode == 2 else printed).split())
+    assert 'the arm was halted' in told
+    assert f'remaster demo --out {out} goes on' in told
     assert 'Traceback' not in error
     assert len(read_session(out / 'session').measurements) >= 2
 
