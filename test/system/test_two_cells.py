@@ -80,7 +80,7 @@ class OneCell:
     def check(self, folder):
         """Every row is where this cell's own hidden World has its marker."""
         session = read_session(self.session)
-        (path,) = folder.glob(f'remaster_world_*%{self.name}')
+        (path,) = folder.glob(f'remaster_world_*.{self.name}')
         world = World.open(path)
         assert world.seed == SEEDS[self.name]
         chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
