@@ -533,8 +533,8 @@ def in_words(group: Sequence[Candidate], context: Context) -> str:
     sentence = sentence[:1].upper() + sentence[1:]
     if first.changes is not None:
         when = _when(first, context).removesuffix(',')
-        changed = 'It ended' if first.ends else 'It began, or changed by so much,'
-        sentence += f' {changed} {when}.'
+        changed = 'ended, or became less' if first.ends else 'began, or changed'
+        sentence += f' It {changed} by so much, {when}.'
     if not context.has_gravity and first.place == 'joint_angle' and 'angle' in first.driver:
         sentence += (
             ' It may be gravity that bends the arm: without link masses in the URDF '

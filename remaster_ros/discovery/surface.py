@@ -502,6 +502,13 @@ class State:
         ends = np.cumsum([0, *(self.surface.pool.sizes[block] for block, _ in self.model)])
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
+    @property
+    def is_physical(self) -> bool:
+        """Whether the weights of the model's blocks have signs that physics allows."""
+        first = [where.start for where in self.places]
+        sign = self.surface.pool.sign[[block for block, _ in self.model]]
+        return bool(np.all(sign * self.weights[first] >= 0.0)) if first else True
+
     @cached_property
     def gains(self) -> FloatArray:
         """Gain in log posterior by adding each block of the pool at each level, (blocks, levels).
@@ -696,8 +703,12 @@ class Walker:
     def _accept(self, state: State, heat: float) -> None:
         """Accept or refuse a state as the chain's next one (Metropolis); note its log posterior.
 
-        ``heat``: exponent of the posterior, the inverse of a temperature.
+        Nothing for a state that is not physical: a block that joined later may have turned the
+        sign of one that was there before. ``heat``: exponent of the posterior, the inverse of a
+        temperature.
         """
+        if not state.is_physical:
+            return
         self.seen[state.key] = state.value
         if np.log(self.rng.random()) < heat * (state.value - self.state.value):
             self.state = state

@@ -246,8 +246,53 @@ class Evaluated:
 
         The product of two: that its family of random effects is present, and that it stands out
         as one of m causes of this family, at prior odds of 1 to m. Candidates with the same
-        `identity` are one cause and have the same probability.
+        `identity` are one cause and have the same probability. Those of a sign that physics
+        excludes are no such cause: 0.
         """
+        return {
+            member: 0.0 if self._is_excluded(member, where, mapping) else self._chances[member]
+            for _, member, where, mapping in self.members
+        }
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether no block, and nothing that stands out of the background, has an excluded sign.
+
+        Beside a background with such a member, the cause of that name that ends or begins in
+        mid-session would have the sign that is allowed, and stand for the rest of the session.
+        """
+        mean = self.estimate[0]
+        starts = [self.where[weights].start for weights in self.candidates[: len(self.blocks)]]
+        if any(
+            block.size == 1 and block.sign * mean[start] < 0.0
+            for (block, _), start in zip(self.blocks, starts, strict=True)
+        ):
+            return False
+        return not self.excluded
+
+    @cached_property
+    def excluded(self) -> set[Candidate]:
+        """Candidates of the families of which a member stands out with an excluded sign."""
+        return {
+            family.candidate
+            for family, member, where, mapping in self.members
+            if self._is_excluded(member, where, mapping)
+            and self._chances[member] >= 0.5
+            # Itself, and not by another axis of the same cause.
+            and self.by_itself[member] > np.log(member.drawn_from)
+        }
+
+    def _is_excluded(self, member: Candidate, where: IntArray, mapping: FloatArray) -> bool:
+        """Return whether the parameter of a candidate in the background has an impossible sign.
+
+        ``where``, ``mapping``: as in `members`. False for a candidate of several parameters.
+        """
+        parameters = mapping @ self.estimate[0][where]
+        return member.size == 1 and member.sign * float(parameters[0]) < 0.0
+
+    @cached_property
+    def _chances(self) -> dict[Candidate, float]:
+        """As `standing_out`, whatever the signs."""
         found = {}
         for family in self.families:
             mine = [entry for entry in self.members if entry[0] is family]
@@ -464,7 +509,7 @@ class Walk:
             if not shapes or form in start.families:
                 continue
             model = tuple(entry for entry in start.model if entry[0] not in shapes)
-            found = evaluated(self.pool, [*start.families, form], model, start)
+            found = self._physical([*start.families, form], model, start)
             if found is not None and found.value > best.value:
                 best = found
         return None if best is start else best
@@ -488,7 +533,9 @@ class Walk:
                     index = np.unravel_index(np.argmax(more.gains), more.gains.shape)
                     value = more.value + more.gains[index] - state.value
                     if value > gain + SETTLED:
-                        gain, model = value, more.with_block(int(index[0]), int(index[1])).key
+                        exchanged = more.with_block(int(index[0]), int(index[1]))
+                        if exchanged.is_physical:
+                            gain, model = value, exchanged.key
             if model != best.model:
                 found.append(self._refitted(model, best, new_background=True))
         better = max(found, key=lambda entry: entry.value, default=None)
@@ -545,7 +592,7 @@ class Walk:
                 added = self.pool.place.get(blocks[index].candidate.key)
                 if added is not None:
                     model = tuple(sorted((*best.model, (added, int(level)))))
-                    entry = evaluated(self.pool, families, model, best)
+                    entry = self._physical(families, model, best)
                     found += [] if entry is None else [entry]
         return found
 
@@ -665,13 +712,19 @@ class Walk:
 
         Too small: a log Bayes factor of at most the price (`log_price`, at least `PRICE`). The
         worse half of these is taken out at a time, and the model fitted again, so that one of
-        two families that imitate each other stays.
+        two families that imitate each other stays. Then those go of which a member stands out
+        with a sign that physics excludes.
         """
         while True:
             worth = [
                 found.log_factor_of_kind(family) - max(PRICE, -log_price([family]))
                 for family in found.families
             ]
+            if min(worth, default=0.0) > 0.0:
+                worth = [
+                    -np.inf if family.candidate in found.excluded else value
+                    for family, value in zip(found.families, worth, strict=True)
+                ]
             hidden = sorted(value for value in worth if value <= 0.0)
             if not hidden:
                 return found
@@ -698,12 +751,19 @@ class Walk:
     def evaluate(self, model: Model, start: Evaluated) -> Evaluated | None:
         """Fit a model with the families of random effects of ``start``, at its own noise.
 
-        The search for the noise begins at that of ``start``. None if it cannot be fitted. A
-        model evaluated before is not fitted again: that result is returned.
+        The search for the noise begins at that of ``start``. None if it cannot be fitted, or is
+        not physical. A model evaluated before is not fitted again: that result is returned.
         """
         if model not in self._known:
-            self._known[model] = evaluated(self.pool, start.families, model, start)
+            self._known[model] = self._physical(start.families, model, start)
         return self._known[model]
+
+    def _physical(
+        self, families: Sequence[Family], model: Model, start: Evaluated
+    ) -> Evaluated | None:
+        """Return `evaluated` of a model; None also if something has a sign physics excludes."""
+        found = evaluated(self.pool, families, model, start)
+        return found if found is not None and found.is_physical else None
 
     def _chain(self, current: Evaluated, hot: bool, before: Evaluated | None = None) -> Chain:
         """Run a chain in rounds, each at the noise and background of the best model so far.
@@ -759,8 +819,8 @@ class Walk:
 
         Tried are one variance for all free forms (splines) of an effect, and one for each of
         them; the better is returned, without families of too little evidence. ``start``: where
-        the search for the noise begins. None if the model cannot be fitted. A model fitted here
-        before is not fitted again: that result is returned.
+        the search for the noise begins. None if the model cannot be fitted, or is not physical. A
+        model fitted here before is not fitted again: that result is returned.
         """
         if model not in self._wholes:
             tried = [
@@ -768,7 +828,11 @@ class Walk:
                 for families in (self.families, self.by_form)
                 if (found := evaluated(self.pool, families, model, start)) is not None
             ]
-            self._wholes[model] = max(tried, key=lambda result: result.value, default=None)
+            self._wholes[model] = max(
+                (found for found in tried if found.is_physical),
+                key=lambda result: result.value,
+                default=None,
+            )
         return self._wholes[model]
 
     def _refitted(self, model: Model, before: Evaluated, new_background: bool) -> Evaluated:
@@ -778,10 +842,10 @@ class Walk:
         ``before``: model with noise to begin at, and returned if ``model`` cannot be fitted;
         ``new_background``: choose the families of random effects anew.
         """
-        if new_background:
+        best = None if new_background else self.evaluate(model, before)
+        if best is None:
+            # Beside another background a model may be physical.
             best = self._whole(model, before)
-        else:
-            best = self.evaluate(model, before)
         if best is None:
             return before
         self._known[model] = best
@@ -824,7 +888,7 @@ class Walk:
             known = self._known.get(chain.best.model)
             if known is None or known.value < chain.best.value:
                 # With its own background; candidates may have been dated since.
-                again = evaluated(self.pool, chain.best.families, chain.best.model, chain.best)
+                again = self._physical(chain.best.families, chain.best.model, chain.best)
                 self._known[chain.best.model] = again
         pooled |= {
             model: evaluation.value

@@ -80,23 +80,23 @@ def switched(context: Context, candidate: Candidate, gap: FloatArray, ends: bool
 def changed_at(candidate: Candidate, changes: Changes, gap: FloatArray) -> Iterator[Candidate]:
     """Yield two changes of a candidate in mid-session, as candidates.
 
-    One that begins at a moment in a gap, in addition to the candidate if the model has that; and
-    one that is present only up to the moment. ``changes``: function that makes their columns;
-    ``gap``: start and end, s since the first row.
+    One that begins at a moment in a gap, and one that is present only up to the moment, each in
+    addition to the candidate if the model has that. Of a candidate whose sign physics allows
+    only one of, both have that sign: what becomes more begins, what becomes less ends.
+    ``changes``: function that makes their columns; ``gap``: start and end, s since the first row.
     """
     begins = replace(
         candidate,
         parameters=tuple(f'{name}_change' for name in candidate.parameters),
         columns=partial(changes, candidate=candidate, gap=gap, ends=False),
         drawn_from=candidate.drawn_from * MOMENTS_OF_CHANGE * RARITY_OF_CHANGE,
-        sign=0,
         moment=float(gap.mean()),
         changes=candidate,
         model_change=None,
     )
     yield begins
     columns = partial(changes, candidate=candidate, gap=gap, ends=True)
-    yield replace(begins, columns=columns, sign=candidate.sign, ends=True)
+    yield replace(begins, columns=columns, ends=True)
 
 
 def changed(
