@@ -197,7 +197,7 @@ def discover_session(
     found, residuals, pool = _to_search(session, before, rng)
     candidates, untestable = _candidates(residuals.context)
     searched = _searched(found, residuals, pool, candidates, rng, report)
-    sampled = partial(_sampled, session, before, rng=rng, report=report, clock=clock)
+    sampled = partial(_sampled, session, before, pool=pool, rng=rng, report=report, clock=clock)
     model = _checked(before, found, searched, sampled)
     answer = _answer(model)
     report('fitting what can be loaded', 0.0)
@@ -501,6 +501,7 @@ def _sampled(
     models: Sequence[tuple[Solution, float]],
     named: Sequence[Candidate],
     *,
+    pool: IntArray,
     rng: np.random.Generator,
     report: Progress,
     clock: Callable[[], float] | None,
@@ -510,10 +511,13 @@ def _sampled(
     Returns the sampled fit, `gain_of` it, and the std of the zero-offsets if the arm is
     exactly its drawing, rad or m, (k,). ``before``: fit of the offsets alone; ``found``: the
     fit that ``models`` extend; ``models``: each with its posterior weight; the others than the
-    first widen the uncertainty; ``named``: candidates of the causes.
+    first widen the uncertainty; ``named``: candidates of the causes; ``pool``: indices of the rows
+    that could be searched, gross errors among them.
     """
     solution = models[0][0]
-    unmodelled = Unmodelled.of(found, data, solution)
+    # Of a large session the rows that were not searched are fitted as well.
+    fitted = np.union1d(data.rows.source, np.setdiff1d(found.kept, pool))
+    unmodelled = Unmodelled.of(found, data, solution, fitted)
     moves = [unmodelled.by_models(models[1:])]
     if solution.candidates:
         moves.append(unmodelled.by_open_offsets())

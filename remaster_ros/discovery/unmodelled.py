@@ -17,6 +17,7 @@ import numpy as np
 from remaster_ros.calibration.estimate import Estimate
 from remaster_ros.calibration.priors import DRAWING_TAILS, OFFSET_STD, STEP_STD, prior_rows
 from remaster_ros.discovery.effects.base import Candidate
+from remaster_ros.discovery.effects.context import BLOCK_ROWS
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.random_effects import kinds
 from remaster_ros.discovery.residuals import Residuals
@@ -32,33 +33,40 @@ NOTICEABLE = 0.1
 class Unmodelled:
     """Normal equations of a solution, and how errors outside its model would move its parameters.
 
-    ``found``: fit whose residuals the discovery explains; ``data``: those residuals.
+    ``found``: fit whose residuals the discovery explains; ``data``: those residuals, on the rows
+    that were searched; ``fitted``: the same on the rows that are fitted, of a large session more.
     """
 
     found: Estimate
     data: Residuals
+    fitted: Residuals
     solution: Solution
-    white: FloatArray  # Columns in units of the noise, (3n, P)
     root: FloatArray  # Of the covariance, (P, P)
     where: IntArray  # Places of the P among natural parameters and those of the candidates
 
     @classmethod
-    def of(cls, found: Estimate, data: Residuals, solution: Solution) -> Unmodelled:
-        """Assemble the normal equations of a solution, with its noise and its priors."""
+    def of(
+        cls,
+        found: Estimate,
+        data: Residuals,
+        solution: Solution,
+        fitted: IntArray | None = None,
+    ) -> Unmodelled:
+        """Assemble the normal equations of a solution, with its noise and its priors.
+
+        ``fitted``: indices of the rows that are fitted, those of ``data`` among them; these
+        alone, if it is None.
+        """
+        every = data if fitted is None or len(fitted) == len(data) else data.only(fitted)
         free, size = found.posterior.free, found.model.size
-        effect_columns = data.columns(solution.candidates)
-        columns = np.concatenate(
-            (data.full_jacobian[data.rows.source][:, :, free], effect_columns), axis=2
-        )
         x = found.model.natural(found.mode.z)
         rows = prior_rows(found.model, found.posterior.priors, x, natural=True)[1][:, free]
-        precision = np.zeros((columns.shape[2],) * 2)
-        precision[: len(free), : len(free)] = rows.T @ rows
-        precision[len(free) :, len(free) :] = solution.prior_precision()
-        white = data.noise_model.whitened(columns, solution.noise).reshape(3 * len(data), -1)
-        root = root_of_inverse(white.T @ white + precision)
-        where = np.concatenate((free, size + np.arange(effect_columns.shape[2])))
-        return cls(found, data, solution, white, root, where)
+        precision = _products(every, found, solution)
+        precision[: len(free), : len(free)] += rows.T @ rows
+        precision[len(free) :, len(free) :] += solution.prior_precision()
+        root = root_of_inverse(precision)
+        where = np.concatenate((free, size + np.arange(len(solution.parameters))))
+        return cls(found, data, every, solution, root, where)
 
     @property
     def size(self) -> int:
@@ -110,19 +118,19 @@ class Unmodelled:
         tolerance = DRAWING_TAILS * self.found.problem.priors.geometry_tolerance_m
         diagonal = np.diag(self.solution.prior_precision())
         precision = dict(zip(_names(self.solution), diagonal, strict=True))
-        shifts = [np.zeros((len(self.data), 3, 0))]
+        shifts: list[tuple[Candidate, FloatArray]] = []
         for family in kinds(self.data, candidates, named):
             for member, mapping, scale in zip(
                 family.members, family.maps, family.scales, strict=True
             ):
                 known = np.array([precision.get(name, np.inf) for name in member.parameters])
                 variance = np.maximum(tolerance**2 - scale / known, 0.0)
-                shifts.append(self.data.columns([member]) @ (mapping * np.sqrt(variance)))
-        white = self.data.noise_model.whitened(np.concatenate(shifts, axis=2), self.solution.noise)
-        Z = white.reshape(len(self.white), -1)
-        U = self.root.T @ (self.white.T @ Z)
-        G = np.eye(Z.shape[1]) + Z.T @ Z - U.T @ U
-        moves = np.zeros((self.size, Z.shape[1]))
+                shifts.append((member, mapping * np.sqrt(variance)))
+        products = _products(self.fitted, self.found, self.solution, shifts)
+        P = len(self.where)
+        U = self.root.T @ products[:P, P:]
+        G = np.eye(U.shape[1]) + products[P:, P:] - U.T @ U
+        moves = np.zeros((self.size, U.shape[1]))
         moves[self.where] = self.root @ np.linalg.solve(np.linalg.cholesky(G), U.T).T
         return moves
 
@@ -166,6 +174,38 @@ class Unmodelled:
         variance[self.where] = np.sum(self.root**2, axis=1)
         variance += sum(np.sum(columns**2, axis=1) for columns in moves)
         return np.sqrt(variance[: self.found.model.joints])
+
+
+def _products(
+    data: Residuals,
+    found: Estimate,
+    solution: Solution,
+    more: Sequence[tuple[Candidate, FloatArray]] = (),
+) -> FloatArray:
+    """Return the products A'A of columns in units of a solution's noise, (P + c, P + c).
+
+    Columns: of the free natural parameters and of the solution's candidates, P, then of ``more``:
+    candidates, each with the matrix that turns its weights into its parameters, c weights in all.
+    """
+    free, blocks = found.posterior.free, [data]
+    if data.path_noise is None and len(data) > BLOCK_ROWS:
+        # Columns of all rows of a large session would be more than all else that is held.
+        blocks = [
+            data.only(data.rows.of_groups(first, last).source)
+            for first, last in data.rows.blocks(BLOCK_ROWS)
+        ]
+    count = len(free) + len(solution.parameters) + sum(turn.shape[1] for _, turn in more)
+    products = np.zeros((count, count))
+    for block in blocks:
+        parts = [
+            block.full_jacobian[block.rows.source][:, :, free],
+            block.columns(solution.candidates),
+            *(block.columns([member]) @ turn for member, turn in more),
+        ]
+        white = block.noise_model.whitened(np.concatenate(parts, axis=2), solution.noise)
+        flat = white.reshape(3 * len(block), count)
+        products += flat.T @ flat
+    return products
 
 
 def _names(solution: Solution) -> list[str]:

@@ -10,6 +10,7 @@ from worlds.discovery_scenes import at_joint, session_with
 
 from remaster_ros.calibration.estimate import Estimate, Problem, estimate
 from remaster_ros.calibration.priors import OFFSET_STD, STEP_STD
+from remaster_ros.discovery import unmodelled
 from remaster_ros.discovery.effects.registry import EFFECTS
 from remaster_ros.discovery.evidence import solve
 from remaster_ros.discovery.residuals import Residuals
@@ -108,6 +109,35 @@ def test_what_other_models_have_is_the_variance_among_them():
     shift = columns[:, :, free] @ move[free]
     expected = 0.5 * (data.base @ (other.base - nothing.base))
     np.testing.assert_allclose(shift, expected, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize('block_rows', [7, 40])
+def test_what_moves_the_fit_does_not_depend_on_blocks_of_rows(monkeypatch, block_rows):
+    found, data, nothing = searched(0.5e-3)
+    at_once = Unmodelled.of(found, data, nothing)
+    monkeypatch.setattr(unmodelled, 'BLOCK_ROWS', block_rows)
+    by_blocks = Unmodelled.of(found, data, nothing)
+    # The products are summed in another order.
+    for moves in (Unmodelled.by_open_offsets, lambda equations: equations.by_drawing(())):
+        np.testing.assert_allclose(
+            by_blocks.std_of_offsets([moves(by_blocks)]),
+            at_once.std_of_offsets([moves(at_once)]),
+            rtol=1e-6,
+        )
+
+
+def test_the_rows_of_a_large_session_that_were_not_searched_count():
+    found, data, nothing = searched(0.5e-3)
+    part = data.only(data.rows.source[::2])
+    every = Unmodelled.of(found, data, nothing)
+    again = Unmodelled.of(found, part, nothing, data.rows.source)
+    for equations in (every, again):
+        assert len(equations.fitted) == len(data)
+    np.testing.assert_allclose(
+        again.std_of_offsets([again.by_open_offsets()]),
+        every.std_of_offsets([every.by_open_offsets()]),
+        rtol=1e-6,
+    )
 
 
 def test_the_tolerance_of_a_drawing_widens_offsets_beside_what_is_named():
