@@ -212,7 +212,8 @@ def discover_session(
     geometry = geometry_model(model.found, causes=measurement_errors)
     if geometry is not None:
         geometry = geometry.beside(offsets_fit, [observation for observation, _ in outliers])
-    empty = _bare(model.data)
+    # With no cause and no background the two are one fit.
+    empty = _bare(model.data) if model.solution.candidates else model.solution
     thinning = None
     if len(pool) < len(model.found.problem.fitted):
         rows = model.data.rows.source
