@@ -474,7 +474,7 @@ class Walk:
         better = self._form_for_shapes()
         if better is not None:
             self.chains.append(self._chain(better, hot=False))
-        changed = self._with_changes(changes) if start is None else []
+        changed = [*self._with_steps(), *self._with_changes(changes)] if start is None else []
         if self._refined() or changed:
             first = max([self._best_found, *changed], key=lambda entry: entry.value)
             self.chains.append(self._chain(first, hot=False))
@@ -556,6 +556,71 @@ class Walk:
             causes.setdefault(identity(self.pool.blocks[block].candidate), block)
         return [(block, int(np.argmax(state.gains[block]))) for block in causes.values()]
 
+    def _with_steps(self) -> list[Evaluated]:
+        """Return models with the likeliest step added, dated between the moments tried.
+
+        A step dated a few configurations wrong explains less than what imitates it (a sensor
+        that wanders or drifts), and no chain has it; at its own moment it may explain more. Each
+        best model of a chain is tried with its background, and without the wander of sensors.
+        [] if no step is likely: none that changes the log posterior by more than -`NEEDED`.
+        """
+        found = []
+        for best in {chain.best.model: chain.best for chain in self.chains}.values():
+            for families in self._backgrounds(best):
+                std = {entry.candidate: best.std[entry.candidate] for entry in families}
+                surface = self._surface(best.noise, std)
+                gain = State.of(surface, best.model).gains.max(axis=1)
+                # Of each cause the likeliest moment of those tried.
+                likeliest: dict[Identity, int] = {}
+                for index in np.argsort(-gain).tolist():
+                    candidate = self.pool.blocks[index].candidate
+                    if gain[index] <= -NEEDED:
+                        break
+                    if candidate.happened and candidate.changes is None:
+                        likeliest.setdefault(identity(candidate), index)
+                if not likeliest:
+                    continue
+                tried = [block.candidate for block in self.pool.blocks]
+                for index in likeliest.values():
+                    self.pool.extend(blocks_of(self.data, self._beside(tried[index], tried)))
+                surface.extend()
+                gains = State.of(surface, best.model).gains.copy()
+                steps = [
+                    entry.candidate.happened and identity(entry.candidate) in likeliest
+                    for entry in self.pool.blocks
+                ]
+                gains[~np.array(steps)] = -np.inf
+                step, level = np.unravel_index(np.argmax(gains), gains.shape)
+                model = tuple(sorted((*best.model, (int(step), int(level)))))
+                entry = self._physical(families, model, best)
+                found += [] if entry is None else [entry]
+        return found
+
+    def _backgrounds(self, best: Evaluated) -> list[tuple[Family, ...]]:
+        """Return the families of a model, and those without the wander of sensors, if it has it.
+
+        The wander imitates whatever happens at a moment.
+        """
+        steady = tuple(
+            entry for entry in best.families if entry.members[0].name != SENSOR_WANDER.name
+        )
+        return [best.families, steady][: 1 + (len(steady) < len(best.families))]
+
+    def _beside(self, candidate: Candidate, tried: Sequence[Candidate]) -> list[Candidate]:
+        """Return a candidate's cause at the gaps near its moment, up to the next moments tried.
+
+        Those that are in the pool are left out. ``tried``: candidates of all effects, with the
+        moments that were tried.
+        """
+        moments = np.unique([entry.moment for entry in tried if entry.name == candidate.name])
+        low = np.max(moments[moments < candidate.moment], initial=-np.inf)
+        high = np.min(moments[moments > candidate.moment], initial=np.inf)
+        return [
+            other
+            for other in at_other_moments(candidate, self.data.part, float(low), float(high))
+            if other.key not in self.pool.place
+        ]
+
     def _with_changes(self, changes: Sequence[Candidate]) -> list[Evaluated]:
         """Add likely changes in mid-session to the pool; return models with the best one added.
 
@@ -570,10 +635,7 @@ class Walk:
             mine = [self.pool.blocks[block] for block, _ in best.model]
             levels = tuple((i, level) for i, (_, level) in enumerate(best.model))
             pool = Pool(self.data, [*mine, *blocks])
-            steady = [
-                entry for entry in best.families if entry.members[0].name != SENSOR_WANDER.name
-            ]
-            for families in [best.families, steady][: 1 + (len(steady) < len(best.families))]:
+            for families in self._backgrounds(best):
                 std = {entry.candidate: best.std[entry.candidate] for entry in families}
                 state = State.of(Surface(pool, best.noise, std), levels)
                 gains = state.gains[len(mine) :]
@@ -620,40 +682,32 @@ class Walk:
             added = added or bool(waiting)
             self.pool.extend(blocks_of(self.data, [*waiting.values()]))
             waiting = {}
-            moments = np.unique([entry.moment for entry in tried if entry.name == candidate.name])
-            low = np.max(moments[moments < candidate.moment], initial=-np.inf)
-            high = np.min(moments[moments > candidate.moment], initial=np.inf)
-            nearby = [
-                other
-                for other in at_other_moments(candidate, context, float(low), float(high))
-                if other.key not in self.pool.place
-            ]
             first = len(self.pool.blocks)
-            self.pool.extend(blocks_of(self.data, nearby))
+            self.pool.extend(blocks_of(self.data, self._beside(candidate, tried)))
             surface = self._surface(best.noise, best.std)
             reduced_state = State.of(surface, best.model[:position] + best.model[position + 1 :])
-            alternatives = [block, *range(first, len(self.pool.blocks))]
             spread = self._spread_of_moments(reduced_state, candidate)
-            for i in alternatives:
-                entry = self.pool.blocks[i]
-                self.pool.blocks[i] = replace(
-                    entry, candidate=replace(entry.candidate, moment_std=spread)
-                )
+            for i, entry in enumerate(self.pool.blocks):
+                # A chain that follows may date it otherwise.
+                if identity(entry.candidate) == identity(candidate):
+                    self.pool.blocks[i] = replace(
+                        entry, candidate=replace(entry.candidate, moment_std=spread)
+                    )
             self._known.clear()
             self._wholes.clear()
-            added = added or len(alternatives) > 1
+            added = added or len(self.pool.blocks) > first
         added = added or bool(waiting)
         self.pool.extend(blocks_of(self.data, [*waiting.values()]))
         happened = [
-            entry
+            candidate
             for block, _ in best.model
-            if (entry := self.pool.blocks[block].candidate).happened
+            if (candidate := self.pool.blocks[block].candidate).happened
         ]
         near_these = {
-            entry.key: entry
+            change.key: change
             for candidate in happened
-            for entry in self._changes_near(candidate.moment)
-            if entry.key not in self.pool.place
+            for change in self._changes_near(candidate.moment)
+            if change.key not in self.pool.place
         }
         self.pool.extend(blocks_of(self.data, [*near_these.values()]))
         return added or bool(near_these)

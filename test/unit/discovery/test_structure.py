@@ -143,6 +143,22 @@ def test_a_step_is_dated_also_where_held_out_readings_lie_between():
     np.testing.assert_allclose(along, share, atol=1e-9)
 
 
+@pytest.mark.qualify
+@pytest.mark.parametrize('index', [60, 87])
+def test_a_sensor_that_moves_between_two_moments_tried_is_no_wander(index):
+    """A step dated a few configurations wrong explains less than a sensor that wanders."""
+    session = session_with(32, pose_sigma_m=0.05e-3)
+    m = session.measurements
+    low, high = np.unique(m.stamp_s[~m.is_validation])[index - 1 : index + 1]
+    moved = (m.stamp_s >= high)[:, None] * np.array([0.6e-3, 0.0, 0.0])
+    session = replace(session, measurements=replace(m, position=m.position + moved))
+    found = discover_session(session, rng=np.random.default_rng(0))
+    ((candidate,),) = found.groups
+    assert (candidate.name, candidate.place) == ('step', 'sensor_frame')
+    assert low < candidate.moment + m.stamp_s.min() < high
+    assert found.unexplained == ()
+
+
 def test_a_marker_that_slips_on_the_tool_is_located():
     plain = residuals_of(session_with(33, **SMALL)).context
     moment = float(np.quantile(moments_of(plain), 0.25))
