@@ -36,7 +36,14 @@ from remaster_ros.discovery.gain import (
     residuals_of,
 )
 from remaster_ros.discovery.geometry_model import GeometryModel, geometry_model
-from remaster_ros.discovery.guard import Unexplained, harm_of, is_harmful, nameless, unfitted
+from remaster_ros.discovery.guard import (
+    Unexplained,
+    harm_of,
+    is_harmful,
+    located,
+    nameless,
+    unfitted,
+)
 from remaster_ros.discovery.marker_offsets import loosened, moved_markers
 from remaster_ros.discovery.omnibus import beyond_noise, structure_left
 from remaster_ros.discovery.random_effects import Family
@@ -371,12 +378,20 @@ def _checked(
     of the session.
     """
     data, effects = searched.data, searched.effects
+    causes, structure = (
+        tuple(
+            effect
+            for effect, group in zip(effects, searched.groups, strict=True)
+            if EFFECTS[group[0].name].is_cause == wanted
+        )
+        for wanted in (True, False)
+    )
     named = [candidate for group in searched.groups for candidate in group]
     unexplained: tuple[Unexplained, ...] = ()
     try:
         fit, (gain, metrics), if_drawn = sampled(found, data, searched.models, named)
     except InsufficientDataError as error:
-        if effects:
+        if causes:
             unexplained = (unfitted(data.errors, effects, error),)
     else:
         if not is_harmful(gain):
@@ -394,8 +409,10 @@ def _checked(
                 if_drawn,
                 (),
             )
-        if effects:
+        if causes:
             unexplained = (harm_of(before, fit, gain, effects),)
+    # That the fitted rows have it does not depend on what a fit beside it predicts elsewhere.
+    unexplained = located(structure) + unexplained
     data = Residuals.of(before)
     solution = _bare(data)
     fit, (gain, metrics), if_drawn = sampled(before, data, [(solution, 1.0)], ())

@@ -38,6 +38,17 @@ class Unexplained(Struct, frozen=True):
     next: str  # What it means and what to do next, one or two sentences
 
 
+def located(structure: Sequence[FoundEffect]) -> tuple[Unexplained, ...]:
+    """Return an entry for each structure without a cause that the search has located.
+
+    ``structure``: such as a sensor's field or wander.
+    """
+    return tuple(
+        Unexplained(found.place, found.driver, found.size_m, found.p_value, found.cause)
+        for found in structure
+    )
+
+
 def suggested(effects: Sequence[FoundEffect]) -> str:
     """Return the titles of causes as a list in words; '' for none.
 

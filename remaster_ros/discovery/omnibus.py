@@ -31,7 +31,7 @@ from remaster_ros.calibration.smooth_functions import of_position
 from remaster_ros.discovery.effects.sensor_field import EFFECT as SENSOR_FIELD
 from remaster_ros.discovery.explain import FoundEffect
 from remaster_ros.discovery.gain import GROSS, rms
-from remaster_ros.discovery.guard import Unexplained
+from remaster_ros.discovery.guard import Unexplained, located
 from remaster_ros.discovery.residuals import Residuals
 from remaster_ros.discovery.solution import Solution
 from remaster_ros.discovery.thinning import of_spread_poses
@@ -53,19 +53,16 @@ def structure_left(
     data: Residuals,
     solution: Solution,
     fit: FitResult,
-    located: Sequence[FoundEffect],
+    structure: Sequence[FoundEffect],
 ) -> tuple[tuple[Unexplained, ...], tuple[tuple[int, str], ...]]:
     """Return all structure that no cause explains, and all single gross errors held out.
 
-    The former includes ``located``, structure that the search has located. The latter:
+    The former includes ``structure``, which the search has located. The latter:
     (observation, what is wrong) of each held-out row with a gross error.
     """
     checks = _Checks(data, solution, fit)
     unexplained = (
-        *(
-            Unexplained(found.place, found.driver, found.size_m, found.p_value, found.cause)
-            for found in located
-        ),
+        *located(structure),
         *errors_by_place(data, solution, SIGNIFICANCE),
         *checks.pairing(),
         *checks.far_off(),
