@@ -273,12 +273,24 @@ def test_five_poses_have_no_background(seed):
     """They do not tell a soft joint from a soft base; the name alone predicts others."""
     few = {'poses': 5, 'validation': 3, 'sigma_m': 0.01e-3, 'pose_sigma_m': 0.02e-3}
     found = discovered(session_with(seed, soft, **few))
-    assert [(effect.name, effect.joints) for effect in found.effects] == [
+    assert found.background == ()
+    assert {c.name for c in found.solution.candidates} == {e.name for e in found.effects}
+    # Odds of 19 to 1 at prior odds of 1 to 20 are a Bayes factor of 380, and those of all K kinds
+    # have a sum of K in expectation where they are not there: another cause is called certain in
+    # at most K / 380 of worlds, 6 % for 22 kinds (Markov; none of 24). What is named from 0.5 to
+    # 0.95 is often not there: with seed 10 a drift of the sensor, 0.68.
+    assert [(e.name, e.joints) for e in found.effects if e.is_certain] == [
         ('joint_compliance', (2,))
     ]
+    assert all('Not certain' in e.cause for e in found.effects if not e.is_certain)
+    ((cause,),) = [group for group in found.groups if group[0].name == 'joint_compliance']
+    data = found.residuals
+    fit = solve(data, (cause,))
+    errors = data.unexplained(fit)[data.context.measurements.is_validation]
     # With all kinds 0.077, 0.114 and 0.159 mm.
-    assert found.gain.held_out_rms_after_m < 0.07e-3
-    assert {candidate.name for candidate in found.solution.candidates} == {'joint_compliance'}
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.07e-3
+    if len(found.effects) == 1:
+        assert found.gain.held_out_rms_after_m < 0.07e-3
 
 
 def test_columns_and_errors_of_a_part_are_those_of_the_whole():
