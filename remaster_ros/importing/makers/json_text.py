@@ -13,7 +13,7 @@ from typing import Any
 
 from remaster_ros.errors import InputError
 from remaster_ros.importing.makers import records
-from remaster_ros.importing.makers.named import NamedColumns, unexpected
+from remaster_ros.importing.makers.named import NUMBER, UNUSED, NamedColumns, unexpected
 
 _START = re.compile(r'\s*(?:\{\s*"|\[\s*[\[{])')
 
@@ -21,9 +21,9 @@ _START = re.compile(r'\s*(?:\{\s*"|\[\s*[\[{])')
 def read(text: str) -> NamedColumns | None:
     """Records of JSON or of JSON lines as named columns; None for other text.
 
-    None also for a list in each line, or a matrix as programs print it. Raises InputError,
-    with the line, for damaged JSON, a key that is there twice, or JSON without records of
-    equal keys.
+    None also for a list in each line, a matrix as programs print it, or a single joint target of
+    RAPID. Raises InputError, with the line, for damaged JSON, a key that is there twice, or
+    JSON without records of equal keys.
     """
     if not _START.match(text):
         return None
@@ -31,7 +31,7 @@ def read(text: str) -> NamedColumns | None:
         data = _Decoder(text).whole()
     except RecursionError:
         raise InputError('line 1: brackets within brackets without end') from None
-    if data is None:
+    if data is None or _is_joint_target(data):
         return None
     found = records.read('JSON', data)
     if found is None:
@@ -40,6 +40,21 @@ def read(text: str) -> NamedColumns | None:
             'such as {"joints": […], "point": […]}, is expected'
         )
     return found
+
+
+def _is_joint_target(data: Any) -> bool:
+    """Whether decoded JSON is a joint target of RAPID: [[axes],[external axes]], one unused.
+
+    `data`: numbers in it as text. A log of one line is JSON as well, of two lists of numbers; of
+    several lines it is none.
+    """
+    if not isinstance(data, records.Items) or len(data) != 2:
+        return False
+    axes, external = data
+    return isinstance(axes, records.Items) and any(
+        isinstance(cell, str) and NUMBER.fullmatch(cell) and float(cell) == UNUSED
+        for cell in (external if isinstance(external, records.Items) else ())
+    )
 
 
 class _Decoder(json.JSONDecoder):

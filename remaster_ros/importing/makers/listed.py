@@ -5,7 +5,13 @@ from __future__ import annotations
 
 import re
 
-from remaster_ros.importing.makers.named import NUMBER, NamedColumns, leading_column, unexpected
+from remaster_ros.importing.makers.named import (
+    NUMBER,
+    UNUSED,
+    NamedColumns,
+    leading_column,
+    unexpected,
+)
 
 # A list in square brackets or braces, or in round ones alone; behind it arguments of a call, or
 # the external axes of RAPID. Each alternative matches in one way only, so that other lines of a
@@ -22,7 +28,6 @@ _MOST_IN_TEXT = 2
 _CALLED = re.compile(r'([A-Za-z_]\w*)\s*\(\s*[\[(]?\s*[-+.\d]')
 _PLACES = re.compile(r'lin|pose|cart|tcp|move_?[lcp]\b|frame|trans', re.IGNORECASE)
 _RAPID = ('jointtarget', 'moveabsj')
-_UNUSED = 9e9
 _BETWEEN = re.compile(r'\s*[,;]\s*|\s+')
 # Characters around a name that are no part of it.
 _DELIMITERS = ' \t:;,="\'('
@@ -106,5 +111,5 @@ def _has_no_external_axes(line: re.Match[str] | None) -> bool:
     external = (line and line['external']) or '0'
     cells = [cell.strip() for cell in external.split(',')]
     return all(
-        NUMBER.fullmatch(cell) and (float(cell) == 0.0 or float(cell) >= _UNUSED) for cell in cells
+        NUMBER.fullmatch(cell) and (float(cell) == 0.0 or float(cell) >= UNUSED) for cell in cells
     )

@@ -16,6 +16,8 @@ NUMBER = re.compile(r'[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?', re.ASCII)
 _TIME = re.compile(r'\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:[.,]\d+)?|\d{5,}\.\d+')
 # An arm to calibrate has at least two joints, and no controller has more than a hundred axes.
 _FEWEST_AXES, _MOST_AXES = 2, 100
+UNUSED = 9e9
+"""Value of an external axis of RAPID that is not used; larger ones are none either."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,13 @@ from __future__ import annotations
 import re
 
 from remaster_ros.errors import InputError
-from remaster_ros.importing.makers.named import NUMBER, NamedColumns, axes_in_order, unexpected
+from remaster_ros.importing.makers.named import (
+    NUMBER,
+    UNUSED,
+    NamedColumns,
+    axes_in_order,
+    unexpected,
+)
 
 _MODULE = re.compile(
     r'^[ \t]*MODULE[ \t]+\w+|\brobtarget[ \t]+\w+[ \t]*:=', re.IGNORECASE | re.MULTILINE
@@ -32,7 +38,6 @@ _LISTED_AXES = re.compile(r'\[\s*\[([^\[\]]*)\]\s*,\s*\[([^\[\]]*)\]\s*\]')
 _ELEMENT = re.compile(r'\s*([A-Za-z]\w*(?:\s*\{\s*\d+\s*\})?)\s*:=\s*')
 # Nothing else in RAPID begins with six numbers.
 _SIX = re.compile(r'(?:=|^)\s*(?:[A-Za-z]\w*\s*:)?[\s\[{}]*(?:[-+.\deE]+\s*,\s*){5}')
-_UNUSED = 9e9
 _EXPECTED = '[[…,…],[…]] with a number for each axis'
 
 
@@ -138,7 +143,7 @@ def _axes(number: int, statement: str, value: re.Match[str]) -> dict[str, str]:
         for i, cell in enumerate((group or '').split(',') if group else (), 1):
             if not NUMBER.fullmatch(cell.strip()):
                 raise unexpected(number, statement, _EXPECTED)
-            if float(cell) < _UNUSED:
+            if float(cell) < UNUSED:
                 axes[f'{letter}{i}'] = cell.strip()
             elif letter == 'J':
                 raise unexpected(number, statement, 'an angle for each axis of the arm')

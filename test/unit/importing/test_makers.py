@@ -175,6 +175,21 @@ def test_times_that_are_all_the_same_are_no_times(tmp_path):
     assert '19 of 20 configurations have one and the same time' in rows.warnings[0]
 
 
+def test_a_log_of_one_target_is_no_matrix_of_two_configurations(tmp_path):
+    """It is JSON as well: its unused external axes are no angles."""
+    (q,) = joints_of(1)
+    log = write(tmp_path, 'log.txt', KINDS['rapid_log'].write(('',), [q]))
+    table = read_table(log)
+    found = find_columns(table, JOINTS)
+    np.testing.assert_allclose(numbers(table, found.joints), [q], atol=1e-9)
+    # Of an axis in use, beside five that are not.
+    rail = write(tmp_path, 'rail.txt', log.read_text().replace('9E+09', '120.5', 1))
+    assert read_table(rail).rows[0][-1] == '120.5'
+    # Without any of that value it is a matrix.
+    matrix = write(tmp_path, 'matrix.json', f'[{[*map(float, q)]}, {[*map(float, -q)]}]')
+    assert len(read_table(matrix).rows) == 2
+
+
 def mutated(rng, content, one_line, comment):
     """Return a text with one thing wrong in it, and whether a row may be lost by it."""
     at = rng.randrange(len(content))
