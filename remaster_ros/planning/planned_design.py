@@ -232,8 +232,9 @@ def _isolated_groups(model: CollisionModel, q: FloatArray, travel: TravelTime) -
     """Return the groups of configurations that have no free path to the largest group.
 
     Each as indices, (m,). Paths are searched from each configuration to its two nearest, then
-    from the largest connected group to each other group, between their two nearest
-    configurations. ``q``: configurations, (n, k).
+    between groups, the largest first, once for each pair of groups: between their two nearest
+    configurations. That ends when the remaining groups together are no larger than the largest.
+    ``q``: configurations, (n, k).
     """
     times = travel.between(q)
     np.fill_diagonal(times, np.inf)
@@ -250,12 +251,21 @@ def _isolated_groups(model: CollisionModel, q: FloatArray, travel: TravelTime) -
 
     for index in range(len(q)):
         any(joins(index, int(other)) for other in np.argsort(times[index])[:2])
-    most = int(np.argmax(np.bincount(part, minlength=1)))
-    for number in np.unique(part[part != most]):
-        between = np.where(np.outer(part == number, part == most), times, np.inf)
-        pair = np.unravel_index(int(np.argmin(between)), between.shape)
-        if np.isfinite(between[pair]):
-            joins(*map(int, pair))
+    # Two nearest may be in one cluster, so that a group is not all that is connected: of an arm
+    # between walls the larger side fell into pieces, and the smaller one was kept.
+    remaining = np.unique(part)
+    while True:
+        number = remaining[int(np.argmax([np.sum(part == each) for each in remaining]))]
+        remaining = remaining[remaining != number]
+        order = [np.min(times[np.ix_(part == number, part == each)]) for each in remaining]
+        for each in remaining[np.argsort(order)]:
+            between = np.where(np.outer(part == each, part == number), times, np.inf)
+            pair = np.unravel_index(int(np.argmin(between)), between.shape)
+            if np.isfinite(between[pair]) and joins(*map(int, pair)):
+                remaining = remaining[remaining != each]
+        most = int(np.argmax(np.bincount(part, minlength=1)))
+        if np.sum(np.isin(part, remaining)) <= np.sum(part == most):
+            break
     return [np.flatnonzero(part == number) for number in np.unique(part[part != most])]
 
 
