@@ -11,9 +11,9 @@ share of its own.
 *Absolute*: from the rows with the correction on, base and marker fitted again. *Toggle*: from the
 differences on - off of one configuration; it sees only what is switched, not what the controller
 has in addition. A state is called if its odds are `ODDS` against each of the others, and neither
-``other`` nor a single joint in another state, if these rows can tell it, is more likely;
-``other``, if its odds are `ODDS`. The noise is unknown: likelihoods are integrated over its
-logarithm.
+``other`` nor a single joint in another state, if these rows can tell it, is more likely, nor any
+such joint more likely by `ODDS`; ``other``, if its odds are `ODDS`. The noise is unknown:
+likelihoods are integrated over its logarithm.
 """
 
 from __future__ import annotations
@@ -320,9 +320,10 @@ def _single_joint_alternatives(
 ) -> list[FloatArray]:
     """Projected displacements, (d,) each, if one joint is in another state than the rest.
 
-    Listed are alternatives that explain the rows better than ``best`` itself; only those that
-    the rows could distinguish from it are considered. ``best``: state of the correction;
-    ``sigma``: noise of a reading per axis, m; ``evidence``: log evidence of ``best``.
+    Listed are alternatives that explain the rows better than ``best`` itself, if these rows were
+    expected to distinguish them from it, and any with odds of 1000 (`ODDS`) against it. ``best``:
+    state of the correction; ``sigma``: noise of a reading per axis, m; ``evidence``: log evidence
+    of ``best``.
     """
     unsure = side.projected(side.unsure(side.commands[best]))
     residual = side.projected(side.measured - side.at[best])
@@ -331,11 +332,13 @@ def _single_joint_alternatives(
     for move in moves.T:
         for share in STATES.values():
             step = (share - STATES[best]) * move
-            if _expected(step, unsure, sigma) > ENOUGH:
-                odd = _integrated(_log_likelihood(residual - step, unsure))
-                # Of what can be told, one in a thousand is on the wrong side of even odds.
-                if odd > evidence:
-                    found.append(step)
+            odds = _integrated(_log_likelihood(residual - step, unsure)) - evidence
+            # Of what can be told, one in a thousand is on the wrong side of even odds. Log odds m
+            # are expected with the variance 2 m: those of a wrong alternative exceed log 1000 in
+            # 1e-4 of cases at most, whatever m is.
+            told = _expected(step, unsure, sigma) > ENOUGH
+            if odds > (0.0 if told else np.log(ODDS)):
+                found.append(step)
     return found
 
 

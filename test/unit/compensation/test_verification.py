@@ -10,9 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm, poisson
 from worlds.verified_arms import Case, measured
 
-from remaster_ros.compensation.verification import verify
+from remaster_ros.compensation.verification import ENOUGH, ODDS, verify
 from remaster_ros.errors import InsufficientDataError
 
 ARMS = int(os.environ.get('VERIFIED_ARMS', '40'))
@@ -46,6 +47,15 @@ def test_one_joint_of_the_wrong_sign_is_named(name):
     # Base and marker take up a constant change of the outermost joints: nothing tells of it but
     # that seven joints share changes, which go with the configuration.
     assert {verdicts[0], verdicts[-1]} <= {'unclear', 'in_use'}
+
+
+@pytest.mark.parametrize('seed', [1048, 1058, 1088])
+def test_a_joint_that_is_told_by_chance_is_told(seed):
+    """Odds of over 10,000 for one joint of the wrong sign, where less was to be expected."""
+    found = verify(*measured(Case(seed, 0.1, 0.1, 'one joint', joint=4)))
+    assert found.verdict == 'unclear'
+    assert found.poses is not None
+    assert found.poses > 10
 
 
 def test_what_is_too_small_is_unclear_with_the_poses_that_would_do():
@@ -112,20 +122,41 @@ def test_shares_over_many_arms(offset_deg, noise_mm):
         assert right.total() >= 0.95 * ARMS * len(STATES)
 
 
+def chance_of_a_state(std):
+    """Return the largest chance that a state is called though a joint has the wrong sign.
+
+    ``std``: of the joint's share, from -1 to 1 of which it takes two. What is so has log odds of
+    the mean m and the variance 2 m: they have to be over log 1000, or, from `ENOUGH` on, over 0.
+    """
+    expected = 2.0 / std**2
+    least = 0.0 if expected > ENOUGH else np.log(ODDS)
+    return norm.cdf((least - expected) / np.sqrt(2.0 * expected))
+
+
 @pytest.mark.qualify
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize('offset_deg', [0.3, 0.1])
 def test_one_joint_of_many_arms(offset_deg):
-    named = blamed = green = 0
+    """A state of the whole is called by chance alone.
+
+    The arm of seven joints is commanded by the smallest change, in which the fifth joint's share
+    may lie within the noise. Where the limit of a chance is exact, 1 % of other seeds exceed it.
+    """
+    named = blamed = green = told = 0
+    chance = 0.0
     for seed in range(1000, 1000 + ARMS):
         joint = 1 + seed % 5
         found = verify(*measured(Case(seed, offset_deg, 0.1, 'one joint', joint)))
-        signs = [result.verdict == 'wrong_sign' for result in found.joints.values()]
+        results = [*found.joints.values()]
+        signs = [result.verdict == 'wrong_sign' for result in results]
         green += found.verdict in STATES
+        told += found.verdict in STATES and 2.0 / results[joint].std ** 2 > ENOUGH
+        chance += chance_of_a_state(results[joint].std)
         named += signs[joint]
         blamed += sum(signs) > signs[joint]
-    print(offset_deg, named / ARMS, blamed / ARMS, green)
+    print(offset_deg, named / ARMS, blamed / ARMS, green, told, chance)
     assert named >= 0.8 * ARMS
     assert blamed <= max(1, 0.01 * ARMS)
-    # Never a state of the whole, but for one by chance.
-    assert green <= max(1, 0.01 * ARMS)
+    assert green <= poisson.ppf(0.99, chance)
+    # Of what can be told one in a thousand: two of forty once in a thousand times.
+    assert told <= max(1, 0.01 * ARMS)
