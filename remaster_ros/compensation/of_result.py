@@ -45,6 +45,8 @@ from remaster_ros.types import FloatArray, Measurements
 
 # Iterations of `_as_predicted`, each of which leaves only the second order of the difference.
 EXACT_STEPS = 2
+# Rounding error of the eigenvalues of a matrix, as a share of the largest.
+ROUNDING = 1e-12
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
     'angle': 'angle',
@@ -300,9 +302,11 @@ def _as_predicted(
 
     ``without``: slices of the fit's further parameters that count as 0. The fit is linear in
     lengths, tilts and other effects, about the zero-offsets found without effects; the arm is
-    not. The difference d of the predictions is removed within the posterior's uncertainty: a
-    step C J' d / σ² with its covariance C. If the data determine everything, C is (J' J /
-    σ²)⁻¹, and the largest eigenvalue of J C J' is σ².
+    not, and its offsets, base and marker do not absorb what the fit's do. The difference d of the
+    predictions is removed within the posterior's uncertainty: a step C J' d / σ² with its
+    covariance C. If the data determine everything, C is (J' J / σ²)⁻¹, and J C J' is σ² in all
+    its directions. Where the fit absorbs what the arm does not, it is more, and the step is
+    J⁺ d: no more than the difference is removed.
     """
     z = fit.predictive.after.copy()
     for parameters in without:
@@ -310,6 +314,9 @@ def _as_predicted(
     rows = of_spread_poses(problem.measurements, problem.fitted)
     m = problem.measurements.select(rows)
     expected = predicted_rows(problem, fit.predictive.model, z)[rows]
+    # The posterior is that of all rows; what poses have in common only adds to it.
+    variance = min(noise.sigma_m for noise in fit.noise.values()) ** 2
+    variance *= len(rows) / len(problem.fitted)
     for _ in range(EXACT_STEPS):
         # Where it is unknown the fit has no growth.
         known = np.isfinite(m.temperature_c)
@@ -324,8 +331,9 @@ def _as_predicted(
                     error[seen] = off[seen] @ turn.T
                     parts[seen] = (model.derivative(state, sensor, marker) @ model.root.T)[seen]
         spread = parts.reshape(-1, len(model.root))
-        gram = spread.T @ spread
-        step = spread.T @ error.ravel() / np.linalg.eigvalsh(gram)[-1]
+        sizes, directions = np.linalg.eigh(spread.T @ spread)
+        along = directions.T @ (spread.T @ error.ravel())
+        step = directions @ (along / np.maximum(sizes, max(variance, ROUNDING * sizes[-1])))
         model = model.with_step(model.root.T @ step)
     return model
 
