@@ -24,6 +24,7 @@ from remaster_ros.calibration.outliers import find_outliers
 from remaster_ros.calibration.result import FitResult
 from remaster_ros.calibration.sampling import Progress, silent
 from remaster_ros.discovery.effects.base import Candidate
+from remaster_ros.discovery.effects.context import Context
 from remaster_ros.discovery.effects.moments import changed
 from remaster_ros.discovery.effects.registry import EFFECTS, effects_of
 from remaster_ros.discovery.evidence import solve
@@ -201,7 +202,7 @@ def discover_session(
     else:
         before = sound_estimate(session, fitted=partial(estimate_beside, moving))
     found, residuals, pool = _to_search(session, before, rng)
-    candidates, untestable = _candidates(residuals)
+    candidates, untestable = _candidates(residuals.context)
     searched = _searched(found, residuals, pool, candidates, rng, report)
     sampled = partial(_sampled, session, before, pool=pool, rng=rng, report=report, clock=clock)
     model = _checked(before, found, searched, sampled)
@@ -310,13 +311,12 @@ def _bare(data: Residuals) -> Solution:
     return solution
 
 
-def _candidates(data: Residuals) -> tuple[list[Candidate], dict[str, str]]:
+def _candidates(context: Context) -> tuple[list[Candidate], dict[str, str]]:
     """Return all candidate causes of a session, and the effects that it cannot show.
 
     The candidates include changes in mid-session, but no marker offsets, which are judged by
     the fit itself. The effects that cannot be shown are given as name -> reason.
     """
-    context = data.context
     effects_tried = effects_of(context)
     untestable = {
         name: why for name, effect in effects_tried.items() if (why := effect.needs(context))
@@ -325,11 +325,10 @@ def _candidates(data: Residuals) -> tuple[list[Candidate], dict[str, str]]:
         candidate
         for name, effect in effects_tried.items()
         if name not in untestable and not effect.moves_the_fit
-        # Rows that are not worked on do not tell between moments, and leave the choice to chance.
-        for candidate in effect.candidates(context if effect.between is None else data.part)
+        for candidate in effect.candidates(context)
     ]
     changes = [(candidate, EFFECTS[candidate.name].changes) for candidate in candidates]
-    return [*candidates, *changed(data.part, changes)], untestable
+    return [*candidates, *changed(context, changes)], untestable
 
 
 def _searched(

@@ -76,7 +76,7 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     demo = start(
         'remaster_ros.cli.main', 'demo', '--out', out, '--candidates', '4', '--no-figures',
         # With the live page it bears that the arm is halted: a person, here, may be at it.
-        '--seed', SEED, '--rate', '20', '--watch',
+        '--seed', SEED, '--watch',
     )  # fmt: skip
     listener = Listener(client)
     rows = out / 'session' / 'observations.csv'
@@ -123,8 +123,8 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
 
     listener.moves()
     inject(world, {'robot': {'estop': 1}})
-    # On its way, before it had begun, or between the two: halted in each case.
-    reasons = ('the robot ',)
+    # On its way, before it had begun, at the end of a piece, or between them: it is halted.
+    reasons = ('the robot ', 'the arm stands ')
     listener.until(
         lambda: any(text in listener.summaries.get('pose_planner', '') for text in reasons),
         90,
@@ -151,7 +151,7 @@ def test_one_fault_after_the_other_and_the_run_completes(start, client, tmp_path
     demo.send_signal(signal.SIGINT)
     demo.communicate(timeout=30)
     # No wrong observation: each against the truth of this seed.
-    truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 20.0).truth
+    truth = make_world(tmp_path / 'world', read_cell('demo'), SEED, 10.0).truth
     session = read_session(out / 'session')
     chain = SerialChain.from_urdf(session.urdf, session.base_link, session.tip_link)
     m = session.measurements

@@ -58,9 +58,13 @@ def spread(found: FloatArray, count: int) -> FloatArray:
 def after(context: Context, gap: FloatArray) -> FloatArray:
     """Probability that each row is after a moment uniform in a gap, (n, 1).
 
-    ``gap``: start and end, start < end, s since the first row.
+    ``gap``: start and end, start < end, s since the first row; here up to the fitted rows around
+    it, as held-out rows do not tell when in between it was.
     """
-    start, end = gap
+    fitted_s = context.elapsed_s[~context.measurements.is_validation]
+    start = np.max(fitted_s[fitted_s <= gap[0]], initial=-np.inf)
+    end = np.min(fitted_s[fitted_s >= gap[1]], initial=np.inf)
+    start, end = np.where(np.isfinite([start, end]), [start, end], gap)
     share: FloatArray = np.clip((context.elapsed_s - start) / (end - start), 0.0, 1.0)
     return share[:, None]
 
