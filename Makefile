@@ -3,7 +3,7 @@
 #                 (OUT=folder SEED=n ARGS='--full' are handed on)
 #   make test     the tests, some eleven minutes on two idle cores (PYTEST='-k name' is handed on;
 #                 PYTEST=test/unit/motion runs one folder, docs/first-change.md)
-#   make qualify  all of them, and the campaigns that it leaves out; an hour and a half on two cores
+#   make qualify  all of them, and the campaigns that it leaves out; some two hours on two cores
 #   make check    lint, types, layers; CI runs this and make test
 #   make bench    the benchmarks, small (BENCH='bench_speed …' chooses, FULL=1 for all sizes)
 #   make mutants FOLDER=remaster_ros/motion    which changes of the code its unit tests do not notice
@@ -47,7 +47,7 @@ test: $(VENV)/installed
 	tools/run-tests $(BIN)/python $(PYTEST)
 
 # What make test leaves out as well, in the same two groups: repetitions, sweeps, campaigns, every row
-# of test/faults/observed.md. An hour and a half on two cores.
+# of test/faults/observed.md. Some two hours on two cores.
 # PYTEST=test/… runs these files alone, PYTEST='-k name' those of all that have the name.
 qualify: $(VENV)/qualify-installed
 	tools/run-tests $(BIN)/python --qualify $(PYTEST)
