@@ -182,7 +182,7 @@ class Demo:
             if complete:
                 raise
             raise DeviceError(
-                f'the arm was halted before enough was measured for a fit ({error}): '
+                f'the arm was halted, and what was measured until then is not fitted ({error}): '
                 f'remaster demo --out {self.out} goes on'
             ) from None
         times, file = self.node.times, None

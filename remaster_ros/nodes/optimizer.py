@@ -47,7 +47,7 @@ from remaster_ros.session.cells.workcell import read_cell
 from remaster_ros.session.records.plan_journal import refuse_unimported
 from remaster_ros.session.records.priors_file import read_priors
 from remaster_ros.session.records.reader import read_session
-from remaster_ros.types import FloatArray, Priors
+from remaster_ros.types import FloatArray, Priors, Session
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,7 @@ class Optimizer(RemasterNode):
         priors or the folder cannot be used, or the data do not allow a fit.
         """
         out = Path(self.p.out)
-        session = read_session(self.p.session)
-        refuse_unimported(session, self.p.session)
+        session = self._session()
         prepare_folder(out, FIT_FILE)
         result = fit_session(
             session,
@@ -165,6 +164,12 @@ class Optimizer(RemasterNode):
         for line in result.implausible:
             self.get_logger().warning(line)
         return report, '; '.join(('fitted', *result.implausible))
+
+    def _session(self) -> Session:
+        """Read the session to fit; raises RemasterError if it cannot be used."""
+        session = read_session(self.p.session)
+        refuse_unimported(session, self.p.session)
+        return session
 
     def _priors(self) -> Priors | None:
         """Priors of the file in the parameter `prior`; None if the parameter is empty.
@@ -188,8 +193,7 @@ class Optimizer(RemasterNode):
         from remaster_ros.reports.result_folder import save_discovery
 
         out = Path(self.p.discovery)
-        session = read_session(self.p.session)
-        refuse_unimported(session, self.p.session)
+        session = self._session()
         prepare_folder(out, DISCOVERY_FILE)
         # Of the same session before more was measured: what was left open then?
         pairs: Sequence[tuple[Any, Any]] = ()

@@ -216,12 +216,14 @@ def refuse_unimported(session: Session, folder: str | os.PathLike[str]) -> None:
         pose.way is None for part in plan.tour.plans.values() for pose in part.poses
     ):
         return
-    recording = f'{folder / "bag"}' if (folder / 'bag').is_dir() else 'BAG (its bag is not there)'
+    recording, where = folder / 'bag', ''
+    if not recording.is_dir():
+        recording, where = Path('BAG'), f', and BAG a bag of it, as {recording} is not there'
     raise InsufficientDataError(
         f'{folder}: by its plan the arm is measured while it moves, so that the rows to fit are '
         f'in the recording of the motion. Import them: remaster import --moving {recording} '
-        f'--cell CELL --proof {folder} --out NEW (CELL is the cell file of the collection), then '
-        'use NEW as the session'
+        f'--cell CELL --proof {folder} --out NEW, where CELL is the cell file of the '
+        f'collection{where}. Then use NEW as the session'
     )
 
 

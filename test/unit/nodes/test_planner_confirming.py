@@ -77,6 +77,13 @@ class Planner:
         assert self.call('confirm')[0]
         assert self.call('collect') == (True, 'collecting')
 
+    def collect(self):
+        """Begin a run without a plan to confirm, and go on until its first pose is announced."""
+        self.peer(RecorderState(waiting_for='', run=''))
+        self.peer(BridgeState(halted=''))
+        assert self.call('collect')[0]
+        self.step_until(lambda: self.announced, 'the first pose')
+
     def services(self):
         """Return the names of the services that confirm a plan."""
         names = {service.service_name for service in self.node.services}
@@ -112,11 +119,8 @@ def begin(tmp_path, monkeypatch):
 
 def test_a_pose_that_a_busy_recorder_has_not_taken_is_repeated_and_not_announced_anew(begin):
     planner = begin(confirm=False)
+    planner.collect()
     node = planner.node
-    planner.peer(RecorderState(waiting_for='', run=''))
-    planner.peer(BridgeState(halted=''))
-    assert planner.call('collect')[0]
-    planner.step_until(lambda: planner.announced, 'the first pose')
     stamp = node._announcements.stamp
     planner.peer(BridgeState(halted='', pose=stamp))
     for minute in range(1, 20):
@@ -134,11 +138,8 @@ def test_a_pose_that_a_busy_recorder_has_not_taken_is_repeated_and_not_announced
 
 def test_a_reported_position_that_is_no_number_does_not_keep_the_planner_from_planning(begin):
     planner = begin(confirm=False)
+    planner.collect()
     node = planner.node
-    planner.peer(RecorderState(waiting_for='', run=''))
-    planner.peer(BridgeState(halted=''))
-    assert planner.call('collect')[0]
-    planner.step_until(lambda: planner.announced, 'the first pose')
     for wrong in (np.nan, np.inf):
         settled = JointState(name=list(node._order.names), position=[wrong, *START[1:]])
         node._on_settled(settled)
