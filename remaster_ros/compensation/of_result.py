@@ -45,8 +45,6 @@ from remaster_ros.types import FloatArray, Measurements
 
 # Iterations of `_as_predicted`, each of which leaves only the second order of the difference.
 EXACT_STEPS = 2
-# Rounding error of the eigenvalues of a matrix, as a share of the largest.
-ROUNDING = 1e-12
 _DRIVERS: dict[str, Driver] = {
     'own_angle': 'angle',
     'angle': 'angle',
@@ -333,7 +331,7 @@ def _as_predicted(
         spread = parts.reshape(-1, len(model.root))
         sizes, directions = np.linalg.eigh(spread.T @ spread)
         along = directions.T @ (spread.T @ error.ravel())
-        step = directions @ (along / np.maximum(sizes, max(variance, ROUNDING * sizes[-1])))
+        step = directions @ (along / np.maximum(sizes, variance))
         model = model.with_step(model.root.T @ step)
     return model
 

@@ -17,7 +17,7 @@ from remaster_ros.discovery.effects.base import Candidate, Changes, Design
 from remaster_ros.discovery.effects.context import Context
 from remaster_ros.types import FloatArray
 
-# Of the configurations, before and after a moment: fewer do not tell it from gross errors.
+# Of the fitted configurations, before and after a moment: fewer do not tell it from gross errors.
 LEAST_SHARE = 0.04
 # Moments at which each effect may change that are tried; those near the best follow.
 MOMENTS_OF_CHANGE = 12
@@ -28,18 +28,22 @@ RARITY_OF_CHANGE = 3
 def gaps(context: Context, low: float = -np.inf, high: float = np.inf) -> FloatArray:
     """Return start and end of the gaps between successive configurations, s, (m, 2).
 
-    Since the first row. Gaps near the start and end of the session are left out (`LEAST_SHARE`).
-    ``low, high``: only gaps that overlap this interval, s.
+    Since the first row. Gaps with few fitted configurations on one side are left out
+    (`LEAST_SHARE`), as those among readings that are all held out at the end. ``low, high``: only
+    gaps that overlap this interval, s.
     """
-    _, row = np.unique(context.measurements.configuration, return_inverse=True)
+    m = context.measurements
+    _, row = np.unique(m.configuration, return_inverse=True)
     first, last = np.full(row.max() + 1, np.inf), np.full(row.max() + 1, -np.inf)
     np.minimum.at(first, row, context.elapsed_s)
     np.maximum.at(last, row, context.elapsed_s)
     order = np.argsort(first)
     first, last = first[order], np.maximum.accumulate(last[order])
     is_gap = first[1:] > last[:-1]
-    edge = max(2, int(LEAST_SHARE * len(first)))
-    inside = (np.arange(1, len(first)) >= edge) & (np.arange(1, len(first)) <= len(first) - edge)
+    is_fitted = np.bincount(row, ~m.is_validation) > 0.0
+    before = np.cumsum(is_fitted[order])
+    edge = max(2, int(LEAST_SHARE * before[-1]))
+    inside = (before[:-1] >= edge) & (before[:-1] <= before[-1] - edge)
     found = np.column_stack([last[:-1], first[1:]])[is_gap & inside]
     return found[(found[:, 1] > low) & (found[:, 0] < high)]
 

@@ -60,6 +60,24 @@ def remembering(session: Session) -> FloatArray:
     return errors
 
 
+def test_moments_lie_between_fitted_rows():
+    """Among readings at the end that are all held out, nothing tells when it was."""
+    session = session_with(1, poses=30, validation=20)
+    m = session.measurements
+    # As `simulate` has them: all that is held out comes last.
+    order = np.argsort(m.is_validation, kind='stable')
+    stamps = np.empty(len(m))
+    stamps[order] = np.arange(len(m), dtype=float)
+    context = residuals_of(replace(session, measurements=replace(m, stamp_s=stamps))).context
+    moments = moments_of(context)
+    fitted_s = context.elapsed_s[~context.measurements.is_validation]
+    assert len(moments) > 5
+    for moment in moments:
+        # At least two configurations on each side.
+        assert np.sum(fitted_s < moment) >= 2
+        assert np.sum(fitted_s > moment) >= 2
+
+
 @pytest.mark.parametrize(
     ('errors', 'driver', 'poses'),
     [
